@@ -1,0 +1,125 @@
+"""LPIPS v0.1 with AlexNet: the perceptual distance of the evaluation, offline and without torchvision.
+
+Zhang et al. 2018, "The Unreasonable Effectiveness of Deep Features as a Perceptual Metric". The weights
+are shipped in `losses/weights`; `losses/fetch_weights.py` regenerates them.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import torch
+from jaxtyping import Float
+from safetensors.torch import load_file
+from torch import Tensor, nn
+from torch.nn import functional
+
+LPIPS_ALEX = Path(__file__).parent / "weights" / "lpips_alex.safetensors"
+"""The shipped weights, fp16: `features.{0..4}.{weight,bias}` and `heads.{0..4}`."""
+
+ALEXNET = ((3, 64, 11, 4, 2), (64, 192, 5, 1, 2), (192, 384, 3, 1, 1), (384, 256, 3, 1, 1), (256, 256, 3, 1, 1))
+"""AlexNet's five convolutions: channels in and out, kernel, stride, padding (torchvision's variant)."""
+
+POOLED_BEFORE = (1, 2)
+"""Convolutions that follow a 3x3 max-pooling of stride 2."""
+
+INPUT_SHIFT = (-0.030, -0.088, -0.188)
+"""Subtracted from each channel of an image in [-1, 1]; ImageNet's mean as the reference rounds it."""
+
+INPUT_SCALE = (0.458, 0.448, 0.450)
+"""Divides each channel after the shift."""
+
+NORM_EPSILON = 1e-10
+"""Added to the length of a feature vector before dividing by it, as the reference does."""
+
+SMALLEST_SIDE = 31
+"""Images with a shorter side leave nothing after AlexNet's second pooling."""
+
+RANGE_TOLERANCE = 1e-3
+"""How far outside [-1, 1] an image may lie before it is taken for one in another range."""
+
+
+class LPIPS(nn.Module):
+    """LPIPS v0.1, AlexNet, frozen: gradients flow to the images, none to the weights.
+
+    Args:
+        weights: a file written by `losses.fetch_weights`; the shipped one by default.
+
+    Raises:
+        FileNotFoundError: if the weights are not there; names the command that makes them.
+    """
+
+    shift: Tensor
+    scale: Tensor
+
+    def __init__(self, weights: Path = LPIPS_ALEX) -> None:
+        super().__init__()
+        if not weights.is_file():
+            raise FileNotFoundError(
+                f"{weights} is missing; run `python -m losses.fetch_weights --lpips-alex` to make it"
+            )
+        self.features = nn.ModuleList(
+            nn.Conv2d(inputs, outputs, kernel, stride, padding)
+            for inputs, outputs, kernel, stride, padding in ALEXNET
+        )
+        self.heads = nn.ParameterList(nn.Parameter(torch.empty(layer[1])) for layer in ALEXNET)
+        self.register_buffer("shift", torch.tensor(INPUT_SHIFT)[:, None, None], persistent=False)
+        self.register_buffer("scale", torch.tensor(INPUT_SCALE)[:, None, None], persistent=False)
+        self.load_state_dict({name: tensor.float() for name, tensor in load_file(weights).items()})
+        self.requires_grad_(False)
+        self.eval()
+
+    def forward(
+        self, a: Float[Tensor, "batch 3 height width"], b: Float[Tensor, "batch 3 height width"]
+    ) -> Float[Tensor, "batch"]:
+        """Return the distance of each pair of images.
+
+        Args:
+            a: gamma-encoded images in [-1, 1], both sides at least 31 px.
+            b: as `a`, of the same shape.
+
+        Returns:
+            Distances, 0 for equal images, seldom above 1.
+
+        Raises:
+            ValueError: quoting the shapes that differ or are too small, or the range found.
+        """
+        _check(a, b)
+        features = self._activations(torch.cat([a, b]))
+        distance = a.new_zeros(a.shape[0])
+        for activation, head in zip(features, self.heads, strict=True):
+            unit_a, unit_b = _unit(activation).chunk(2)
+            weighted = ((unit_a - unit_b) ** 2 * head[:, None, None]).sum(dim=1)
+            distance = distance + weighted.mean(dim=(1, 2))
+        return distance
+
+    def _activations(self, images: Tensor) -> list[Tensor]:
+        """Return the five rectified feature maps of images in [-1, 1]."""
+        x = (images - self.shift) / self.scale
+        activations = []
+        for index, convolution in enumerate(self.features):
+            if index in POOLED_BEFORE:
+                x = functional.max_pool2d(x, 3, stride=2)
+            x = functional.relu(convolution(x))
+            activations.append(x)
+        return activations
+
+
+def _unit(features: Tensor) -> Tensor:
+    # vector_norm, unlike sqrt of a sum, has a zero (not NaN) gradient where all features are zero.
+    return features / (torch.linalg.vector_norm(features, dim=1, keepdim=True) + NORM_EPSILON)
+
+
+def _check(a: Tensor, b: Tensor) -> None:
+    if a.shape != b.shape or a.ndim != 4 or a.shape[1] != 3:
+        raise ValueError(
+            f"LPIPS compares two tensors of one shape [batch, 3, height, width], "
+            f"got {tuple(a.shape)} and {tuple(b.shape)}"
+        )
+    if min(a.shape[-2:]) < SMALLEST_SIDE:
+        raise ValueError(f"LPIPS needs sides of at least {SMALLEST_SIDE} px, got {tuple(a.shape)}")
+    for name, image in (("first", a), ("second", b)):
+        low, high = (float(value) for value in torch.aminmax(image.detach()))
+        # Written so that NaN fails too.
+        if not (low >= -1.0 - RANGE_TOLERANCE and high <= 1.0 + RANGE_TOLERANCE):
+            raise ValueError(f"LPIPS expects images in [-1, 1], the {name} lies in [{low:.4g}, {high:.4g}]")

@@ -1,0 +1,1 @@
+"""Everything differentiable: the material, the renderer, the networks, their data and their trainer."""

@@ -1,0 +1,251 @@
+"""The paper's generator (Sec. 5.1): one encoder, four decoders with skips, and a light head.
+
+Any width and depth; `GeneratorConfig()` is the paper's network with the layer shapes of the authors'
+public checkpoint. What the network sees and says in plain numbers is fixed by `predict`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+from torch.nn import functional
+
+from nets.color import to_network_input
+from nets.render import PointLight
+from nets.svbrdf import CHANNELS, MAPS, SVBRDF
+
+LEAKY_SLOPE = 0.2
+DROPOUT = 0.5
+DROPOUT_LEVELS = 3
+"""Dropout follows this many of the deepest decoder levels."""
+
+LIGHT_HEAD_WIDTHS = (256, 128, 64, 32, 16, 3)
+
+LIGHT_MEAN = (-0.0012, 0.0018, 3.0988)
+LIGHT_DEVIATION = (1.6891, 1.6833, 2.7202)
+"""The light head predicts a standardised position: position = output x deviation + mean (surface units)."""
+
+MIN_NORMAL_Z = 0.02
+"""Predicted normals are kept this far above the horizon before they are normalised."""
+
+MIN_LIGHT_Z = 0.2
+"""Predicted lights are kept this far above the surface, surface units."""
+
+MIN_ROUGHNESS = 1e-3
+"""Predicted roughness is kept above this: zero is not a legal roughness."""
+
+
+@dataclass(frozen=True)
+class GeneratorConfig:
+    """The shape of a generator.
+
+    Attributes:
+        width: channels of the first convolution; 64 in the paper.
+        levels: stride-2 convolutions of the encoder; 8 in the paper, so that 256 px shrink to 1.
+        deep_multiplier: cap of the channels as a multiple of `width`; 8 in the paper.
+    """
+
+    width: int = 64
+    levels: int = 8
+    deep_multiplier: int = 8
+
+    def __post_init__(self) -> None:
+        """Refuse shapes that cannot be built."""
+        if self.width < 1 or self.deep_multiplier < 1 or not 2 <= self.levels <= 10:
+            raise ValueError(f"not a generator: {self}")
+
+    @property
+    def encoder_widths(self) -> tuple[int, ...]:
+        """Output channels of each encoder level: w, 2w, 4w, 8w, 8w, ..."""
+        return tuple(self.width * min(2**level, self.deep_multiplier) for level in range(self.levels))
+
+    @property
+    def multiple(self) -> int:
+        """Image sides must be multiples of this."""
+        return int(2**self.levels)
+
+    def as_dict(self) -> dict[str, int]:
+        """Return plain numbers for a checkpoint's header."""
+        return asdict(self)
+
+
+PAPER_GENERATOR = GeneratorConfig()
+NARROW_GENERATOR = GeneratorConfig(width=16, levels=7, deep_multiplier=4)
+"""What is trained on two CPU cores and shipped: see docs/architecture.md for what differs and why."""
+
+
+class UpBlock(nn.Module):
+    """Nearest x2, then two 4x4 "same" convolutions without bias, as Deschaintre et al. 2018."""
+
+    def __init__(self, inputs: int, outputs: int) -> None:
+        """Build for `inputs` and `outputs` channels."""
+        super().__init__()
+        self.conv1 = nn.Conv2d(inputs, outputs, 4, bias=False)
+        self.conv2 = nn.Conv2d(outputs, outputs, 4, bias=False)
+
+    def forward(self, x: Float[Tensor, "b inputs h w"]) -> Float[Tensor, "b outputs h2 w2"]:
+        """Double the resolution."""
+        x = upsampled_convolution(x, self.conv1.weight)
+        return self.conv2(functional.pad(x, SAME_PADDING))
+
+
+SAME_PADDING = (1, 2, 1, 2)
+"""An even kernel has no middle: pad 1 left and top, 2 right and bottom, as TensorFlow's "same"."""
+
+
+def upsampled_convolution_reference(
+    x: Float[Tensor, "b inputs h w"], weight: Float[Tensor, "outputs inputs 4 4"]
+) -> Float[Tensor, "b outputs h2 w2"]:
+    """Upsample by nearest x2, pad, convolve: the definition, kept to test the fast path against."""
+    x = functional.interpolate(x, scale_factor=2.0, mode="nearest")
+    return functional.conv2d(functional.pad(x, SAME_PADDING), weight)
+
+
+def upsampled_convolution(
+    x: Float[Tensor, "b inputs h w"], weight: Float[Tensor, "outputs inputs 4 4"]
+) -> Float[Tensor, "b outputs h2 w2"]:
+    """Compute `upsampled_convolution_reference` as one transposed convolution.
+
+    Nearest x2 is a transposed convolution with a 2x2 kernel of ones, so both steps together are one with
+    the 5x5 kernel `flip(weight) * ones(2, 2)`: 25 products per input pixel instead of 64, and no
+    upsampled tensor in memory. On two cores this is 2 to 5 times faster, forward and backward.
+    """
+    flipped = weight.flip(2, 3)
+    kernel = sum(
+        functional.pad(flipped, (left, 1 - left, top, 1 - top)) for left in (0, 1) for top in (0, 1)
+    )
+    return functional.conv_transpose2d(x, kernel.transpose(0, 1), stride=2, padding=2, output_padding=1)
+
+
+class Decoder(nn.Module):
+    """One map's decoder: `levels` up-blocks fed by the level below and the encoder's skip."""
+
+    def __init__(self, config: GeneratorConfig, outputs: int) -> None:
+        """Build for a map of `outputs` channels."""
+        super().__init__()
+        skips = config.encoder_widths[-2::-1]
+        blocks, norms = [], []
+        inputs = config.encoder_widths[-1]
+        for skip in skips:
+            blocks.append(UpBlock(inputs, skip))
+            norms.append(nn.InstanceNorm2d(skip, affine=True))
+            inputs = 2 * skip
+        blocks.append(UpBlock(inputs, outputs))
+        self.blocks = nn.ModuleList(blocks)
+        self.norms = nn.ModuleList(norms)
+        self.dropout = nn.Dropout(DROPOUT)
+
+    def forward(self, features: list[Tensor]) -> Float[Tensor, "b outputs h w"]:
+        """Decode encoder features (finest first) to one map in [-1, 1]."""
+        x = features[-1]
+        for level, norm in enumerate(self.norms):
+            x = norm(self.blocks[level](functional.leaky_relu(x, LEAKY_SLOPE)))
+            if level < DROPOUT_LEVELS:
+                x = self.dropout(x)
+            x = torch.cat([x, features[-2 - level]], dim=1)
+        return torch.tanh(self.blocks[-1](functional.leaky_relu(x, LEAKY_SLOPE)))
+
+
+class LightHead(nn.Module):
+    """Six fully connected layers from the bottleneck to a standardised light position."""
+
+    def __init__(self, inputs: int) -> None:
+        """Build for a bottleneck of `inputs` channels."""
+        super().__init__()
+        widths = (inputs, *LIGHT_HEAD_WIDTHS)
+        self.layers = nn.ModuleList(nn.Linear(a, b) for a, b in zip(widths[:-1], widths[1:], strict=True))
+
+    def forward(self, bottleneck: Float[Tensor, "b c h w"]) -> Float[Tensor, "b 3"]:
+        """Return the standardised position; a bottleneck larger than 1x1 is averaged first."""
+        x = bottleneck.mean(dim=(2, 3))
+        for layer in self.layers[:-1]:
+            x = functional.leaky_relu(layer(x), LEAKY_SLOPE)
+        light: Tensor = self.layers[-1](x)
+        return light
+
+
+class Generator(nn.Module):
+    """Photo to maps and light.
+
+    `forward` speaks the network's own range; `predict` takes a linear photo and returns a legal
+    `SVBRDF` and a `PointLight`.
+    """
+
+    def __init__(self, config: GeneratorConfig = PAPER_GENERATOR) -> None:
+        """Build with random weights."""
+        super().__init__()
+        self.config = config
+        widths = config.encoder_widths
+        self.encoder = nn.ModuleList(
+            nn.Conv2d(inputs, outputs, 4, stride=2, padding=1, bias=False)
+            for inputs, outputs in zip((3, *widths[:-1]), widths, strict=True)
+        )
+        # Neither the first nor the last level is normalised: they carry absolute levels.
+        self.encoder_norms = nn.ModuleList(nn.InstanceNorm2d(width, affine=True) for width in widths[1:-1])
+        self.decoders = nn.ModuleDict({name: Decoder(config, CHANNELS[name]) for name in MAPS})
+        self.light_head = LightHead(widths[-1])
+
+    def encode(self, photo: Float[Tensor, "b 3 h w"]) -> list[Tensor]:
+        """Return the features of every encoder level, finest first, before activation."""
+        features = [self.encoder[0](photo)]
+        for level, conv in enumerate(self.encoder[1:]):
+            x = conv(functional.leaky_relu(features[-1], LEAKY_SLOPE))
+            features.append(self.encoder_norms[level](x) if level < len(self.encoder_norms) else x)
+        return features
+
+    def forward(self, photo: Float[Tensor, "b 3 h w"]) -> tuple[Float[Tensor, "b 10 h w"], Float[Tensor, "b 3"]]:
+        """Map an encoded photo in [-1, 1] to maps in [-1, 1] (order of `MAPS`) and a standardised light.
+
+        Raises:
+            ValueError: if a side is not a multiple of `config.multiple`, naming the shape.
+        """
+        multiple = self.config.multiple
+        if photo.shape[-1] % multiple or photo.shape[-2] % multiple:
+            raise ValueError(f"photo has shape {tuple(photo.shape)}, its sides must be multiples of {multiple}")
+        features = self.encode(photo)
+        maps = torch.cat([self.decoders[name](features) for name in MAPS], dim=1)
+        return maps, self.light_head(features[-1])
+
+    @torch.no_grad()
+    def predict(self, photo: Float[Tensor, "b 3 h w"]) -> tuple[SVBRDF, PointLight]:
+        """Estimate material and light of linear photos (clamped to 1 here), sides as in `forward`."""
+        training = self.training
+        self.eval()
+        try:
+            maps, light = self(to_network_input(photo))
+        finally:
+            self.train(training)
+        return maps_to_svbrdf(maps), light_from_output(light)
+
+
+def maps_to_svbrdf(maps: Float[Tensor, "b 10 h w"]) -> SVBRDF:
+    """Turn network maps in [-1, 1] into a legal material: [0, 1], normals upward and unit."""
+    raw = SVBRDF.from_channels(maps)
+    xy, z = raw.normal[:, :2], raw.normal[:, 2:].clamp(min=MIN_NORMAL_Z)
+    return SVBRDF(
+        functional.normalize(torch.cat([xy, z], dim=1), dim=1),
+        (raw.diffuse + 1.0) / 2.0,
+        ((raw.roughness + 1.0) / 2.0).clamp(min=MIN_ROUGHNESS),
+        (raw.specular + 1.0) / 2.0,
+    )
+
+
+def svbrdf_to_maps(svbrdf: SVBRDF) -> Float[Tensor, "b 10 h w"]:
+    """Invert `maps_to_svbrdf`: the network's targets in [-1, 1]."""
+    scaled = svbrdf.map(lambda tensor: tensor * 2.0 - 1.0)
+    return SVBRDF(svbrdf.normal, scaled.diffuse, scaled.roughness, scaled.specular).channels()
+
+
+def light_from_output(output: Float[Tensor, "b 3"]) -> PointLight:
+    """Turn the light head's standardised output into a white unit light above the surface."""
+    position = output * output.new_tensor(LIGHT_DEVIATION) + output.new_tensor(LIGHT_MEAN)
+    position = torch.cat([position[:, :2], position[:, 2:].clamp(min=MIN_LIGHT_Z)], dim=1)
+    return PointLight(position, torch.ones_like(position))
+
+
+def light_to_output(position: Float[Tensor, "b 3"]) -> Float[Tensor, "b 3"]:
+    """Standardise a light position: the light head's target."""
+    return (position - position.new_tensor(LIGHT_MEAN)) / position.new_tensor(LIGHT_DEVIATION)

@@ -1,0 +1,1 @@
+"""Engines that minimise the refinement objective; `reference` is the obvious one."""

@@ -1,0 +1,77 @@
+"""The reference engine: eager autograd and Adam. Slow, obvious, and what every fast path is held to."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import torch
+from torch import Tensor
+
+from losses.refinement import photo_distance
+from nets.render import Geometry, shade
+from refine.capture import Capture
+from refine.parametrization import Parameters
+
+ADAM_BETAS = (0.9, 0.999)
+
+Progress = Callable[[int, float], None]
+"""Called after every iteration with its number (from 1) and loss."""
+
+
+def descend(
+    start: Parameters,
+    offsets: dict[str, Tensor],
+    capture: Capture,
+    geometry: Geometry,
+    *,
+    iterations: int,
+    learning_rate: float,
+    progress: Progress | None = None,
+) -> tuple[Parameters, list[float]]:
+    """Minimise the photo's distance over additive offsets to some maps' parameters.
+
+    Args:
+        start: where every pixel begins.
+        offsets: zero tensors to optimise, by map name. Full-size ones move every pixel by its own
+            gradient; `[1, C, 1, 1]` ones move all pixels by the gradient averaged over all of them.
+        capture: the photo to explain.
+        geometry: of the light and camera, fixed.
+        iterations: Adam steps.
+        learning_rate: Adam's, decayed along a half cosine to a tenth.
+        progress: told of every iteration.
+
+    Returns:
+        The parameters with the lowest loss seen, and the loss before every step and after the last.
+    """
+    moving = {name: offset.detach().clone().requires_grad_(True) for name, offset in offsets.items()}
+    optimizer = torch.optim.Adam(list(moving.values()), lr=learning_rate, betas=ADAM_BETAS)
+    schedule = torch.optim.lr_scheduler.CosineAnnealingLR(
+        optimizer, T_max=max(1, iterations), eta_min=learning_rate / 10.0
+    )
+
+    def distance() -> Tensor:
+        rendering = shade(start.shifted(moving).svbrdf(), geometry)
+        return photo_distance(rendering, capture.photo, capture.unsaturated)
+
+    history: list[float] = []
+    best, best_loss = {name: value.detach().clone() for name, value in moving.items()}, float("inf")
+
+    def keep(loss: float) -> None:
+        nonlocal best, best_loss
+        history.append(loss)
+        if loss < best_loss:
+            best_loss = loss
+            best = {name: value.detach().clone() for name, value in moving.items()}
+
+    for iteration in range(iterations):
+        optimizer.zero_grad(set_to_none=True)
+        loss = distance()
+        keep(float(loss.detach()))
+        loss.backward()
+        optimizer.step()
+        schedule.step()
+        if progress is not None:
+            progress(iteration + 1, history[-1])
+    with torch.no_grad():
+        keep(float(distance()))
+    return start.shifted(best), history

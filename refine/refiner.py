@@ -1,0 +1,241 @@
+"""`Refiner`: photo in, material out. The whole of refinement in one straight line."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from losses.refinement import photo_distance
+from nets.checkpoint import load_model
+from nets.render import Camera, PointLight, render, shade, shading_geometry, surface_points
+from nets.svbrdf import SVBRDF
+from refine.capture import Capture
+from refine.engine.reference import descend
+from refine.initialization import Predict, Predictor, initialize
+from refine.light import fit_light
+from refine.maps import MapFormat, NormalConvention, write_maps
+from refine.parametrization import Parameters
+from refine.photo import ColorSpaceChoice, Photo, photo_from_array, read_photo, resize_photo
+from refine.stages import Recipe, find_recipe
+
+DEFAULT_RESOLUTION = 256
+"""Longer side of the maps, pixels: what the network was trained on."""
+
+DEFAULT_RECIPE = "paper"
+
+Report = Callable[[str, int, int, float], None]
+"""Progress: stage name, iteration (from 1), iterations of all stages, loss."""
+
+
+@dataclass(frozen=True)
+class Refined:
+    """The result of one fit.
+
+    Attributes:
+        svbrdf: the refined maps.
+        initial: the maps refinement started from.
+        light: the light used, given or estimated.
+        camera: the camera used.
+        capture: the photo as it was explained.
+        losses: loss before every step and after the last, by stage name.
+        seconds: wall-clock time by stage name.
+        recipe: what was done.
+        notes: everything done to the photo, in plain words.
+        source: file name of the photo, or `array`.
+    """
+
+    svbrdf: SVBRDF
+    initial: SVBRDF
+    light: PointLight
+    camera: Camera
+    capture: Capture
+    losses: dict[str, list[float]]
+    seconds: dict[str, float]
+    recipe: Recipe
+    notes: tuple[str, ...] = ()
+    source: str = "array"
+    settings: dict[str, Any] = field(default_factory=dict)
+
+    @torch.no_grad()
+    def render(self, light: PointLight | None = None, camera: Camera | None = None) -> Tensor:
+        """Render the refined maps, linear `[1, 3, H, W]`; defaults to the photo's light and camera."""
+        return render(self.svbrdf, light or self.light, camera or self.camera)
+
+    def save(
+        self,
+        folder: str | Path,
+        stem: str | None = None,
+        *,
+        format: MapFormat | None = None,
+        normal_convention: NormalConvention = "opengl",
+    ) -> dict[str, Path]:
+        """Write maps and re-rendering to `folder` as `<stem>_normal.png` and so on; see `refine.maps`."""
+        return write_maps(
+            folder,
+            stem or (Path(self.source).stem if self.source != "array" else "material"),
+            self.svbrdf,
+            rendering=self.render(),
+            format=format,
+            normal_convention=normal_convention,
+        )
+
+
+class Refiner:
+    """Turns photos into materials with one model and one recipe.
+
+    Example:
+        >>> refined = Refiner("default").fit("photo.jpg", iters=100)  # doctest: +SKIP
+        >>> refined.save("out")  # doctest: +SKIP
+    """
+
+    def __init__(
+        self,
+        model: str | Path | Predict | Predictor = "default",
+        recipe: str | Recipe = DEFAULT_RECIPE,
+        *,
+        camera: Camera | None = None,
+        resolution: int | None = DEFAULT_RESOLUTION,
+        seed: int = 0,
+        device: str | torch.device = "cpu",
+    ) -> None:
+        """Set up.
+
+        Args:
+            model: a checkpoint's name or path, or any callable from a linear photo `[1, 3, 256, 256]` to
+                an `SVBRDF` of that size and a `PointLight`.
+            recipe: a name in `refine.stages.RECIPES`, or a `Recipe`.
+            camera: how the photo was taken; the authors' perspective camera by default.
+            resolution: longer side of the maps in pixels; None keeps the photo's.
+            seed: of everything random, for models or recipes that draw numbers.
+            device: where to compute.
+
+        Raises:
+            nets.checkpoint.CheckpointError: if a named checkpoint cannot be loaded.
+            ValueError: for an unknown recipe.
+        """
+        self.device = torch.device(device)
+        if isinstance(model, str | Path):
+            network = load_model(model)
+            network.to(self.device)
+            model = network
+        self.model = model
+        self.recipe = find_recipe(recipe) if isinstance(recipe, str) else recipe
+        self.camera = camera or Camera()
+        self.resolution = resolution
+        self.seed = seed
+
+    def fit(
+        self,
+        img: str | Path | Photo | np.ndarray | Tensor,
+        *,
+        light: PointLight | None = None,
+        iters: int | None = None,
+        color_space: ColorSpaceChoice = "auto",
+        progress: Report | None = None,
+    ) -> Refined:
+        """Recover the material of one photo.
+
+        Args:
+            img: a file, an array `[H, W, C]` or a tensor `[3, H, W]`; see `refine.photo` for how values
+                become linear light.
+            light: the flash, if known; otherwise the light head's estimate, fitted to the photo.
+            iters: steps of all stages together; None takes the recipe's, 0 returns the initialization.
+            color_space: how `img` is encoded.
+            progress: called after every iteration.
+
+        Raises:
+            refine.errors.UserError: if the photo cannot be read or used.
+            ValueError: if `iters` is negative.
+        """
+        torch.manual_seed(self.seed)
+        recipe = self.recipe if iters is None else self.recipe.with_iterations(iters)
+        photo = _photo(img, color_space)
+        if self.resolution is not None:
+            photo = resize_photo(photo, self.resolution)
+        capture = Capture(
+            photo.linear.clamp(max=1.0).to(self.device), photo.unsaturated.to(self.device), self.camera, light
+        )
+        seconds: dict[str, float] = {}
+
+        clock = time.perf_counter()
+        initial, guess = initialize(self.model, capture.photo)
+        seconds["initialization"] = time.perf_counter() - clock
+
+        if light is None and recipe.light_fit is not None and recipe.iterations > 0:
+            clock = time.perf_counter()
+            light = fit_light(initial, guess, capture, recipe.light_fit).to(self.device)
+            seconds["light"] = time.perf_counter() - clock
+        light = light or guess
+        svbrdf, losses = run_stages(initial, light, capture, recipe, seconds, progress)
+        return Refined(
+            svbrdf.detach(),
+            initial,
+            light,
+            self.camera,
+            replace(capture, light=light),
+            losses,
+            seconds,
+            recipe,
+            photo.notes,
+            photo.source,
+        )
+
+
+def run_stages(
+    initial: SVBRDF,
+    light: PointLight,
+    capture: Capture,
+    recipe: Recipe,
+    seconds: dict[str, float],
+    progress: Report | None = None,
+) -> tuple[SVBRDF, dict[str, list[float]]]:
+    """Run a recipe's stages from an initialization under a fixed light.
+
+    Returns:
+        The material (the initialization itself, untouched, if the recipe has no iterations) and the losses
+        of every stage; `seconds` gains one entry per stage.
+    """
+    height, width = initial.size
+    geometry = shading_geometry(surface_points(height, width, device=capture.photo.device), light, capture.camera)
+    with torch.no_grad():
+        start = photo_distance(shade(initial, geometry), capture.photo, capture.unsaturated)
+    losses = {"initialization": [float(start)]}
+    if recipe.iterations == 0:
+        return initial, losses
+    parameters = Parameters.from_svbrdf(initial)
+    finished = 0
+    for stage in recipe.stages:
+        clock = time.perf_counter()
+        offsets = {name: zero.to(capture.photo.device) for name, zero in stage.offsets(height, width).items()}
+
+        def tell(iteration: int, loss: float, name: str = stage.name, before: int = finished) -> None:
+            if progress is not None:
+                progress(name, before + iteration, recipe.iterations, loss)
+
+        parameters, losses[stage.name] = descend(
+            parameters,
+            offsets,
+            capture,
+            geometry,
+            iterations=stage.iterations,
+            learning_rate=stage.learning_rate,
+            progress=tell,
+        )
+        finished += stage.iterations
+        seconds[stage.name] = time.perf_counter() - clock
+    return parameters.svbrdf(), losses
+
+
+def _photo(img: str | Path | Photo | np.ndarray | Tensor, color_space: ColorSpaceChoice) -> Photo:
+    if isinstance(img, Photo):
+        return img
+    if isinstance(img, str | Path):
+        return read_photo(img, color_space=color_space)
+    return photo_from_array(img, color_space=color_space)

@@ -1,0 +1,114 @@
+"""Stages of refinement and the recipes made of them: data that can be printed, saved and replayed."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass, field, replace
+from typing import Any
+
+import torch
+
+from nets.svbrdf import CHANNELS, MAPS
+from refine.light import LightFit
+
+
+@dataclass(frozen=True)
+class GlobalStage:
+    """Move some maps as a whole: every pixel by the gradient averaged over all pixels (paper Sec. 6.1)."""
+
+    iterations: int = 100
+    learning_rate: float = 0.05
+    maps: tuple[str, ...] = ("roughness", "specular")
+
+    @property
+    def name(self) -> str:
+        """How logs and files call this stage."""
+        return "global"
+
+    def offsets(self, height: int, width: int) -> dict[str, torch.Tensor]:
+        """Return the zero offsets that this stage optimises: one per channel."""
+        return {name: torch.zeros(1, _parameters(name), 1, 1) for name in self.maps}
+
+
+@dataclass(frozen=True)
+class PixelStage:
+    """Move some maps pixel by pixel."""
+
+    iterations: int = 400
+    learning_rate: float = 0.03
+    maps: tuple[str, ...] = MAPS
+
+    @property
+    def name(self) -> str:
+        """How logs and files call this stage."""
+        return "per-pixel"
+
+    def offsets(self, height: int, width: int) -> dict[str, torch.Tensor]:
+        """Return the zero offsets that this stage optimises: one per channel and pixel."""
+        return {name: torch.zeros(1, _parameters(name), height, width) for name in self.maps}
+
+
+Stage = GlobalStage | PixelStage
+
+
+@dataclass(frozen=True)
+class Recipe:
+    """A named sequence of stages.
+
+    Attributes:
+        name: how it is asked for.
+        light_fit: how an unknown light is found; None takes the light head's word.
+        stages: in order.
+    """
+
+    name: str
+    light_fit: LightFit | None = field(default_factory=LightFit)
+    stages: tuple[Stage, ...] = ()
+
+    @property
+    def iterations(self) -> int:
+        """Steps of all stages together."""
+        return sum(stage.iterations for stage in self.stages)
+
+    def with_iterations(self, total: int) -> Recipe:
+        """Return this recipe with its stages scaled so that they take `total` steps together."""
+        if total < 0:
+            raise ValueError(f"iterations must be 0 or more, got {total}")
+        ends = [0]
+        for stage in self.stages:
+            ends.append(ends[-1] + stage.iterations)
+        marks = [round(end * total / max(1, ends[-1])) for end in ends]
+        stages = tuple(
+            replace(stage, iterations=after - before)
+            for stage, before, after in zip(self.stages, marks[:-1], marks[1:], strict=True)
+        )
+        return replace(self, stages=stages)
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return plain data, stage names included, for the result's JSON."""
+        return {
+            "name": self.name,
+            "light_fit": asdict(self.light_fit) if self.light_fit else None,
+            "stages": [{"stage": stage.name, **asdict(stage)} for stage in self.stages],
+        }
+
+
+RECIPES: dict[str, Recipe] = {
+    "paper": Recipe("paper", stages=(GlobalStage(), PixelStage())),
+}
+"""All recipes by name. `paper` is Ours+ of Table 1: global roughness and specular, then all maps per pixel."""
+
+
+def find_recipe(name: str) -> Recipe:
+    """Return a recipe by name.
+
+    Raises:
+        ValueError: naming the known ones.
+    """
+    if name not in RECIPES:
+        raise ValueError(f"no recipe is called {name!r}; the known ones are {', '.join(sorted(RECIPES))}")
+    return RECIPES[name]
+
+
+def _parameters(name: str) -> int:
+    # A unit normal has two free numbers, its slopes.
+    return 2 if name == "normal" else CHANNELS[name]
