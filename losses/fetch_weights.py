@@ -17,7 +17,7 @@ import tempfile
 import zipfile
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
@@ -72,12 +72,12 @@ class NumpyUnpickler(pickle.Unpickler):
 
     # The array rebuilder under whatever name the installed numpy gives it.
     _reconstruct = np.empty(0).__reduce__()[0]
-    _allowed = {
+    _allowed: ClassVar[dict[tuple[str, str], Any]] = {
         ("numpy.core.multiarray", "_reconstruct"): _reconstruct,
         ("numpy._core.multiarray", "_reconstruct"): _reconstruct,
         ("numpy", "ndarray"): np.ndarray,
         ("numpy", "dtype"): np.dtype,
-    }  # fmt: skip
+    }
 
     def find_class(self, module: str, name: str) -> Any:
         """Return an allowed global.
@@ -152,7 +152,9 @@ def metadata() -> dict[str, str]:
 def main() -> None:
     """Regenerate the file named on the command line."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
-    parser.add_argument("--lpips-alex", action="store_true", required=True, help="write lpips_alex.safetensors")
+    parser.add_argument(
+        "--lpips-alex", action="store_true", required=True, help="write lpips_alex.safetensors"
+    )
     parser.add_argument("--out", type=Path, default=LPIPS_ALEX, help="file to write")
     arguments = parser.parse_args()
     with tempfile.TemporaryDirectory() as folder:

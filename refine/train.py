@@ -75,7 +75,7 @@ def train(
     architecture = GeneratorConfig(width, levels, deep_multiplier)
     torch.manual_seed(seed)
     objective = L1Objective()
-    source = batch_source(MaterialPool(pool, part="train"), Augmentation(), FlashPhotography(), POOL_SHARES)
+    source = batch_source(MaterialPool(pool, part="train"), Augmentation(specular=0.4, exposure=0.4), FlashPhotography(), POOL_SHARES)
     trainer = Trainer(Generator(architecture), source, objective, config)  # type: ignore[arg-type]
     state = out / "state.pt"
     if resume and state.exists():

@@ -53,7 +53,7 @@ class Augmentation:
     mix_probability: float = 0.3
     mix_range: tuple[float, float] = (0.1, 0.9)
     smooth_masks: float = 0.5
-    hue: float = 0.5
+    hue: float = 0.35
     saturation: float = 0.25
     gain: float = 0.1
     exposure: float = 0.3
@@ -65,7 +65,20 @@ class Augmentation:
     @staticmethod
     def none() -> Augmentation:
         """Return settings that only resize."""
-        return Augmentation((1.0, 1.0), False, 0, False, 0, (0.1, 0.9), 0, 0, 0, 0, 0, 0, 0, 0, 0)
+        return Augmentation(
+            scale=(1.0, 1.0),
+            rotate=False,
+            flip=False,
+            mix_probability=0.0,
+            hue=0.0,
+            saturation=0.0,
+            gain=0.0,
+            exposure=0.0,
+            roughness=0.0,
+            specular=0.0,
+            specular_hue=0.0,
+            relief=0.0,
+        )
 
 
 @dataclass(frozen=True)
@@ -165,19 +178,21 @@ def view_tile(svbrdf: SVBRDF, pose: Pose, size: int) -> SVBRDF:
 
     stride = float(pose.scale.max()) * width / size
     samples = max(1, math.ceil(stride / MAXIMUM_STRIDE - 1e-6))
-    grid = functional.affine_grid(theta, [svbrdf.batch, 1, size * samples, size * samples], align_corners=False)
-    seen = functional.grid_sample(
-        svbrdf.channels(), grid, mode="bilinear", padding_mode="border", align_corners=False
+    grid = functional.affine_grid(
+        theta, [svbrdf.batch, 1, size * samples, size * samples], align_corners=False
     )
-    if samples > 1:
-        seen = functional.avg_pool2d(seen, samples)
-    plane = torch.einsum("bij,bjhw->bihw", matrix, seen[:, :2])
-    normal = unit_normal(torch.cat([plane, seen[:, 2:3]], dim=1))
+
+    def look(image: Tensor) -> Tensor:
+        seen = functional.grid_sample(image, grid, padding_mode="border", align_corners=False)
+        return functional.avg_pool2d(seen, samples) if samples > 1 else seen
+
+    seen = svbrdf.map(look)  # map by map: joining the channels first costs more than it saves
+    plane = torch.einsum("bij,bjhw->bihw", matrix, seen.normal[:, :2])
     return SVBRDF(
-        normal,
-        seen[:, 3:6].clamp(0.0, 1.0),
-        seen[:, 6:7].clamp(ROUGHNESS_FLOOR, 1.0),
-        seen[:, 7:10].clamp(0.0, 1.0),
+        unit_normal(torch.cat([plane, seen.normal[:, 2:]], dim=1)),
+        seen.diffuse.clamp(0.0, 1.0),
+        seen.roughness.clamp(ROUGHNESS_FLOOR, 1.0),
+        seen.specular.clamp(0.0, 1.0),
     )
 
 
@@ -235,7 +250,9 @@ def mix(svbrdf: SVBRDF, generator: torch.Generator, settings: Augmentation) -> S
     return SVBRDF(unit_normal(blended.normal), blended.diffuse, blended.roughness, blended.specular)
 
 
-def _hue_matrix(angle: Float[Tensor, "batch"], saturation: Float[Tensor, "batch"]) -> Float[Tensor, "batch 3 3"]:
+def _hue_matrix(
+    angle: Float[Tensor, "batch"], saturation: Float[Tensor, "batch"]
+) -> Float[Tensor, "batch 3 3"]:
     """Return matrices that turn colours about the grey axis and scale their distance from it."""
     grey = torch.full((3, 3), 1.0 / 3.0)
     cross = torch.tensor([[0.0, -1.0, 1.0], [1.0, 0.0, -1.0], [-1.0, 1.0, 0.0]]) / math.sqrt(3.0)

@@ -1,4 +1,4 @@
-"""Image files to float arrays and back, and resizing: the only place of `nets.data` that touches pixels on disk.
+"""Image files to float arrays and back, and resizing: all pixels on disk that `nets.data` reads pass here.
 
 Values are passed on as stored. No colour conversion happens here; callers state the transfer curve.
 """
@@ -12,7 +12,6 @@ from pathlib import Path
 import numpy as np
 import OpenImageIO as oiio
 import torch
-import torch.nn.functional as functional
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
@@ -115,8 +114,9 @@ def decode_normal(
 
 def unit_normal(vectors: Float[Tensor, "batch 3 h w"]) -> Float[Tensor, "batch 3 h w"]:
     """Normalise, after raising z to `NORMAL_Z_FLOOR`; a zero vector becomes the flat normal."""
-    z = vectors[:, 2:].clamp(min=NORMAL_Z_FLOOR)
-    return functional.normalize(torch.cat([vectors[:, :2], z], dim=1), dim=1)
+    x, y, z = vectors[:, 0:1], vectors[:, 1:2], vectors[:, 2:3].clamp(min=NORMAL_Z_FLOOR)
+    inverse = (x * x + y * y + z * z).rsqrt()  # much faster than a norm along the channels
+    return torch.cat([x * inverse, y * inverse, z * inverse], dim=1)
 
 
 def resize(

@@ -37,8 +37,10 @@ SPECULAR_LEVEL_F0 = 0.08
 
 ROLES: dict[str, tuple[str, ...]] = {
     "basecolor": ("basecolor", "basecolour", "albedo", "diffuse", "color", "colour", "diff", "col", "bc"),
-    "normal": ("normalgl", "normalopengl", "norgl", "nrmgl", "normal", "nor", "nrm", "norm", "normals")
-    + ("normaldx", "normaldirectx", "nordx", "nrmdx"),
+    "normal": (
+        *("normalgl", "normalopengl", "norgl", "nrmgl", "normal", "nor", "nrm", "norm", "normals"),
+        *("normaldx", "normaldirectx", "nordx", "nrmdx"),
+    ),
     "roughness": ("roughness", "rough", "rgh"),
     "glossiness": ("glossiness", "gloss", "smoothness"),
     "metallic": ("metallic", "metalness", "metallness", "mtl", "metal"),
@@ -104,6 +106,7 @@ def read_pbr_folder(
     *,
     size: int | None = None,
     normal_convention: Literal["opengl", "directx"] = "opengl",
+    normal_gamma: Literal["linear", "srgb"] = "linear",
     specular_workflow: Literal["ior_level", "f0"] = "ior_level",
 ) -> SVBRDF:
     """Read a folder of textures as one material.
@@ -118,6 +121,8 @@ def read_pbr_folder(
         size: pixels of the longer side to resize to; None keeps the base colour's size.
         normal_convention: green of normal maps whose name does not say it: up (`opengl`) or down.
             A name with `gl` or `dx` (`NormalDX`, `nor_dx`) overrules it.
+        normal_gamma: `srgb` repairs normal maps that a converter encoded as if they were colours
+            (a flat surface then reads 188 instead of 128).
         specular_workflow: what a file named specular holds: Blender's IOR level, so that the dielectric F0 is
             0.08 times its value, or (`f0`, of specular/glossiness materials) F0 itself, in sRGB.
 
@@ -154,7 +159,7 @@ def read_pbr_folder(
         folder, base, None if metallic is None else grey(metallic), data("specular"), specular_workflow
     )
     return SVBRDF(
-        normal=_read_normal(files["normal"], height, width, normal_convention),
+        normal=_read_normal(files["normal"], height, width, normal_convention, normal_gamma),
         diffuse=diffuse.clamp(0.0, 1.0),
         roughness=grey(roughness).clamp(ROUGHNESS_FLOOR, 1.0),
         specular=specular.clamp(0.0, 1.0),
@@ -182,7 +187,11 @@ def _reflectances(
 
 
 def _read_normal(
-    path: Path, height: int, width: int, convention: Literal["opengl", "directx"]
+    path: Path,
+    height: int,
+    width: int,
+    convention: Literal["opengl", "directx"],
+    gamma: Literal["linear", "srgb"],
 ) -> Float[Tensor, "1 3 h w"]:
     match = _match(path)
     assert match is not None
@@ -194,6 +203,8 @@ def _read_normal(
     encoded, _ = _read(path)
     if encoded.shape[1] != 3:
         raise DataError(f"{path} is a normal map with a single channel")
+    if gamma == "srgb":
+        encoded = srgb_to_linear(encoded)
     return unit_normal(resize(decode_normal(encoded, flip_green=convention == "directx"), height, width))
 
 

@@ -2,8 +2,7 @@
 
     python -m nets.data.pool --out runs/pool --procedural 1200 --materials DIR --size 384 --seed 0
 
-Each entry is [10, S, S]: normal (n + 1) / 2, diffuse as its square root (dark albedo needs the codes),
-roughness as it is, specular as its square root. Give only training folders: what the pool holds is trained on.
+Each entry is [10, S, S], as `pool_format` says. Give only training folders: what it holds is trained on.
 """
 
 from __future__ import annotations
@@ -15,89 +14,34 @@ import os
 import shutil
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from multiprocessing import get_context
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
-from nets.data.images import ROUGHNESS_FLOOR, DataError, resize, unit_normal
+from nets.data.images import DataError, resize, unit_normal
 from nets.data.pbr import read_pbr_folder
+from nets.data.pool_format import Entry, Part, decode, encode, from_planes, licence_of, part_of
+from nets.data.procedural import FAMILIES, HELD_OUT_FAMILIES, generate
 from nets.svbrdf import SVBRDF
+
+__all__ = ["Entry", "MaterialPool", "Part", "build_pool", "decode", "encode", "make", "part_of", "plan"]
 
 ARRAY = "materials.npy"
 INDEX = "index.json"
 
+VERSION = 2
+"""Of what `build_pool` makes of one request; raised when that changes, so that older pools are built anew."""
+
 CROP_FACTOR = 1.25
 """A source at least this many times the pool's size also gives a crop at its native resolution."""
 
-LICENCES = {"infinigen": "BSD-3-Clause (generator)", "unity_measured": "MIT"}
-"""Licences of folder collections (`collection__name`); see `licence_of`."""
-
-DEFAULT_LICENCE = "CC0-1.0"
-"""Licence of the other collections of the training data (ambientCG, cgbookcase, Poly Haven)."""
-
-Part = Literal["train", "validation"]
-
-
-@dataclass(frozen=True)
-class Entry:
-    """Where one material of a pool comes from.
-
-    Attributes:
-        name: of the source; variants of one source share it.
-        kind: `procedural` or `pbr`.
-        collection: procedural family, or the folder's name up to `__`.
-        variant: `whole` or `crop`.
-        seed: of the generator or the crop.
-        licence: as far as known.
-        source: the folder, or empty.
-    """
-
-    name: str
-    kind: Literal["procedural", "pbr"]
-    collection: str
-    variant: Literal["whole", "crop"]
-    seed: int
-    licence: str
-    source: str = ""
-
-
-def encode(svbrdf: SVBRDF) -> UInt8[Tensor, "batch 10 h w"]:
-    """Quantise materials to the pool's 8-bit encoding."""
-    maps = [(svbrdf.normal + 1.0) / 2.0, svbrdf.diffuse.sqrt(), svbrdf.roughness, svbrdf.specular.sqrt()]
-    return (torch.cat(maps, dim=1).clamp(0.0, 1.0) * 255.0).round().to(torch.uint8)
-
-
-def decode(stored: UInt8[Tensor, "batch 10 h w"]) -> SVBRDF:
-    """Invert `encode`; returns legal float32 materials."""
-    maps = stored.float().div_(255.0)
-    diffuse, specular = maps[:, 3:6].square(), maps[:, 7:10].square()
-    roughness = maps[:, 6:7].clamp(min=ROUGHNESS_FLOOR)
-    return SVBRDF(unit_normal(maps[:, :3] * 2.0 - 1.0), diffuse, roughness, specular)
-
-
-def part_of(name: str, holdout: float = 0.05) -> Part:
-    """Say whether a source is trained on or kept for validation: by a hash of its name, so for good.
-
-    Args:
-        name: of the source (`Entry.name`); all its variants fall in one part.
-        holdout: share of names kept for validation.
-    """
-    digest = hashlib.sha256(name.encode()).digest()
-    return "validation" if int.from_bytes(digest[:8], "big") < holdout * 2**64 else "train"
-
-
-def licence_of(folder: Path) -> str:
-    """Return the licence of a material folder: first line of its LICENSE file, or its collection's."""
-    for name in ("LICENSE", "LICENSE.txt", "LICENCE", "LICENCE.txt"):
-        if (folder / name).is_file():
-            return (folder / name).read_text(encoding="utf-8", errors="replace").strip().split("\n")[0]
-    return LICENCES.get(folder.name.split("__")[0], DEFAULT_LICENCE)
+MINIMUM_MEAN_Z = 0.6
+"""Folders whose normals lean further on average are left out: bakes with relief in wrong units."""
 
 
 class MaterialPool:
@@ -205,19 +149,17 @@ def make(entry: Entry, size: int) -> UInt8[Tensor, "1 10 size size"] | None:
         size: side in pixels; smaller sources are enlarged.
 
     Returns:
-        The encoded material; None for a crop of a source that is not `CROP_FACTOR` times larger.
+        The encoded material; None for a folder whose normals lean too far (`MINIMUM_MEAN_Z`), and for a crop
+        of a source that is not `CROP_FACTOR` times larger.
 
     Raises:
         DataError: the source cannot be read.
     """
     if entry.kind == "procedural":
-        from nets.data.procedural import generate
-
-        maps = generate(entry.collection, size, entry.seed)
-        planes = [maps.normal, maps.diffuse, maps.roughness[..., None], maps.specular]
-        stacked = np.ascontiguousarray(np.concatenate(planes, axis=2).transpose(2, 0, 1), dtype=np.float32)
-        return encode(SVBRDF.from_channels(torch.from_numpy(stacked)[None]).validate())
+        return encode(from_planes(generate(entry.collection, size, entry.seed)))
     source = read_pbr_folder(Path(entry.source))
+    if float(source.normal[:, 2].mean()) < MINIMUM_MEAN_Z:
+        return None
     shorter = min(source.size)
     side = shorter if entry.variant == "whole" else size
     if entry.variant == "crop" and shorter < CROP_FACTOR * size:
@@ -249,19 +191,21 @@ def build_pool(
         size: side of the stored tiles in pixels.
         procedural: number of generated materials, taking turns among the families that are not held out.
         folders: each holds material folders (`read_pbr_folder`). All are stored whole (centre square,
-            resized); those of at least `CROP_FACTOR` times the size give a random crop besides.
+            resized); those of at least `CROP_FACTOR` times the size give a random crop besides. Sources that
+            lean too far (`MINIMUM_MEAN_Z`) are left out and named in the index.
         seed: of everything random; the same seed and sources give the same pool.
         workers: processes; 0 works in this one.
         progress: called with the number of materials done and their total.
 
     Raises:
-        DataError: a folder cannot be read as a material.
+        DataError: a folder cannot be read as a material, or nothing is left to store.
     """
     out = Path(out)
     entries = plan([Path(folder) for folder in folders], size=size, procedural=procedural, seed=seed)
     if not entries:
         raise DataError(f"{out} would be a pool of no materials")
-    request = {"size": size, "seed": seed, "entries": [asdict(entry) for entry in entries]}
+    listed = [asdict(entry) for entry in entries]
+    request = {"version": VERSION, "size": size, "seed": seed, "entries": listed}
     key = hashlib.sha256(json.dumps(request).encode()).hexdigest()[:16]
     if (out / INDEX).is_file() and json.loads((out / INDEX).read_text()).get("request") == key:
         return
@@ -274,6 +218,8 @@ def build_pool(
         if progress is not None:
             progress(done, len(entries))
     rows = [number for number, present in enumerate(kept) if present]
+    if not rows:
+        raise DataError(f"{out} would be a pool of no materials: all of them lean too far")
     partial = out / f".{key}.npy"
     array = np.lib.format.open_memmap(partial, mode="w+", dtype=np.uint8, shape=(len(rows), 10, size, size))
     for row, number in enumerate(rows):
@@ -282,7 +228,15 @@ def build_pool(
     del array
     (out / INDEX).unlink(missing_ok=True)  # an index never describes another array
     os.replace(partial, out / ARRAY)
-    index = {"request": key, "size": size, "seed": seed, "entries": [asdict(entries[n]) for n in rows]}
+    left_out = sorted({entry.name for entry in entries} - {entries[number].name for number in rows})
+    index = {
+        "request": key,
+        "version": VERSION,
+        "size": size,
+        "seed": seed,
+        "left_out": left_out,
+        "entries": [listed[number] for number in rows],
+    }
     _write_text(out / INDEX, json.dumps(index, indent=1))
     shutil.rmtree(parts)
 
@@ -315,8 +269,6 @@ def _one_thread() -> None:
 
 
 def _cycle() -> Iterator[str]:
-    from nets.data.procedural import FAMILIES, HELD_OUT_FAMILIES
-
     names = sorted(set(FAMILIES) - set(HELD_OUT_FAMILIES))
     while True:
         yield from names

@@ -1,4 +1,4 @@
-"""Strips, the Deschaintre file format: tiles side by side, `[input |] normal | diffuse | roughness | specular`.
+"""Strips, the Deschaintre file format: `[input |] normal | diffuse | roughness | specular` side by side.
 
 8-bit, normals stored as (n + 1) / 2. The diffuse, roughness and specular of the published sets are linear.
 """

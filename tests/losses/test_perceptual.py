@@ -45,9 +45,11 @@ def picture(kind: str) -> Tensor:
         "shifted": torch.sin(0.35 * (column + 3) + 0.1 * row + channel),
         "dimmed": 0.5 * stripes - 0.2,
         "checks": torch.sign(torch.sin(0.5 * column) * torch.sin(0.5 * row) + 1e-3) * (0.9 - 0.2 * channel),
-        "blobs": 2 * torch.exp(-(torch.sin(0.06 * row) ** 2) * 3 - torch.cos(0.05 * column + channel) ** 2) - 1,
+        "blobs": 2 * torch.exp(-(torch.sin(0.06 * row) ** 2) * 3 - torch.cos(0.05 * column + channel) ** 2)
+        - 1,
         # The classic one-line hash of GLSL shaders.
-        "noise": 2 * torch.frac(torch.abs(torch.sin(12.9898 * row + 78.233 * column + channel)) * 43758.5) - 1,
+        "noise": 2 * torch.frac(torch.abs(torch.sin(12.9898 * row + 78.233 * column + channel)) * 43758.5)
+        - 1,
     }[kind]
     return image[None].float()
 
@@ -79,7 +81,7 @@ def test_gradients_flow_to_the_images_and_descend(distance: LPIPS) -> None:
     assert gradient is not None
     assert bool(torch.isfinite(gradient).all())
     step = 0.01 * gradient / gradient.abs().max()
-    assert float(distance((image - step).detach(), target)) < float(before)
+    assert float(distance((image - step).detach(), target)) < float(before.detach())
     assert all(parameter.grad is None for parameter in distance.parameters())
 
 

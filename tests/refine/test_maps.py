@@ -47,7 +47,9 @@ def pixels(path: Path) -> np.ndarray:
     opened = oiio.ImageInput.open(str(path))
     assert opened is not None, path
     spec = opened.spec()
-    return opened.read_image(0, 0, 0, spec.nchannels, "float").reshape(spec.height, spec.width, spec.nchannels)
+    stored = opened.read_image(0, 0, 0, spec.nchannels, "float")
+    assert stored is not None, path
+    return stored.reshape(spec.height, spec.width, spec.nchannels)
 
 
 def attribute(path: Path, name: str) -> object:
@@ -114,6 +116,12 @@ def test_files_say_what_their_colours_are(tmp_path: Path) -> None:
         assert attribute(path, "DateTime") is None
 
 
+def test_an_unknown_normal_convention_is_refused() -> None:
+    """Below the public functions, whose signatures the suite's type checker guards first."""
+    with pytest.raises(UserError, match="'vulkan' is unknown; choose opengl or directx"):
+        maps._with_convention(some_material().normal, "vulkan")
+
+
 def test_directx_flips_green_and_nothing_else(tmp_path: Path) -> None:
     material = some_material()
     opengl = write_maps(tmp_path, "gl", material)
@@ -131,15 +139,13 @@ def test_directx_flips_green_and_nothing_else(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("format", FORMATS, ids=str)
-def test_same_material_same_bytes(tmp_path: Path, format: MapFormat, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_same_material_same_bytes(tmp_path: Path, format: MapFormat) -> None:
     material = some_material()
     first = write_maps(tmp_path / "first", "stone", material, rendering=material.diffuse, format=format)
-    # A timestamp would differ by years: a clock that stands still could not hide it.
-    monkeypatch.setenv("TZ", "Pacific/Kiritimati")
     second = write_maps(tmp_path / "second", "stone", material, rendering=material.diffuse, format=format)
     for name in first:
         assert first[name].read_bytes() == second[name].read_bytes(), name
-        assert attribute(first[name], "DateTime") is None
+        assert attribute(first[name], "DateTime") is None  # equal bytes within one second prove little
         assert attribute(first[name], "Software") is None
 
 
@@ -193,12 +199,10 @@ def test_illegal_materials_and_renderings_are_refused_before_any_file(tmp_path: 
         write_maps(tmp_path, "stone", material, rendering=material.diffuse[..., :-1])
     with pytest.raises(ValueError, match="rendering"):
         write_maps(tmp_path, "stone", material, rendering=material.diffuse * torch.nan)
-    with pytest.raises(UserError, match="choose opengl or directx"):
-        write_maps(tmp_path, "stone", material, normal_convention="vulkan")  # type: ignore[arg-type]
     assert os.listdir(tmp_path) == []
 
 
-@pytest.mark.parametrize(("extension", "bits"), [("png", 32), ("exr", 8), ("jpg", 8)])
+@pytest.mark.parametrize(("extension", "bits"), [("png", 32), ("exr", 8)])
 def test_formats_that_do_not_exist_are_refused(extension: str, bits: int) -> None:
     with pytest.raises(UserError, match=f"no {bits}-bit {extension}"):
         MapFormat(extension, bits)  # type: ignore[arg-type]
@@ -221,7 +225,7 @@ def test_reading_says_what_is_wrong(tmp_path: Path) -> None:
         read_maps(tmp_path, "stone", extension="png")
 
 
-def test_black_normals_are_not_a_material(tmp_path: Path) -> None:
+def test_normals_without_a_direction_are_not_a_material(tmp_path: Path) -> None:
     paths = write_maps(tmp_path, "stone", some_material())
     oiio.ImageBuf(np.full((24, 40, 3), 0.5, np.float32)).write(str(tmp_path / "flat.exr"))
     paths["normal"].unlink()
@@ -235,3 +239,11 @@ def test_zero_roughness_in_a_file_becomes_the_smallest_legal_one(tmp_path: Path)
     oiio.ImageBuf(np.zeros((24, 40, 1), np.uint8)).write(str(paths["roughness"]))
     roughness = read_maps(tmp_path, "stone").roughness
     assert float(roughness.min()) == float(roughness.max()) == pytest.approx(maps.SMALLEST_ROUGHNESS)
+
+
+def test_normals_of_other_programs_are_made_unit_length_and_turned_to_the_viewer(tmp_path: Path) -> None:
+    paths = write_maps(tmp_path, "stone", some_material(), format=MapFormat("exr", 32))
+    stored = np.full((24, 40, 3), (0.9, 0.5, 0.49), np.float32)  # 0.8 long, just below the horizon
+    assert oiio.ImageBuf(stored).write(str(paths["normal"]))
+    normal = read_maps(tmp_path, "stone").normal
+    torch.testing.assert_close(normal[0, :, 3, 4], torch.tensor([1.0, 0.0, 0.0]))
