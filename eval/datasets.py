@@ -15,7 +15,6 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from nets.color import gamma_decode
 from nets.data.images import DataError, resize, unit_normal
 from nets.data.pbr import read_pbr_folder
 from nets.data.strips import read_strip
@@ -67,6 +66,7 @@ class Protocol:
         lights: novel lights per scene; fewer are the first of the twenty.
         seed: of the novel lights.
         stored_input: use the photo stored in a strip, where there is one, instead of rendering it.
+            Des18's are linear, as their maps are: about 1.2 times our rendering of them, light unknown.
     """
 
     size: int = SIZE
@@ -182,7 +182,7 @@ def _read(path: Path, kind: Literal["strips", "pbr"], index: int, protocol: Prot
     truth = SVBRDF(unit_normal(resized.normal), resized.diffuse, resized.roughness, resized.specular)
     light: PointLight | None
     if protocol.stored_input and stored is not None:
-        photo, light = to_square(gamma_decode(stored), protocol.size), None
+        photo, light = to_square(stored, protocol.size), None
     else:
         photo, light = input_photo(truth)
     lights = novel_lights(index, protocol.lights, protocol.seed)

@@ -9,6 +9,7 @@ from __future__ import annotations
 import argparse
 import hashlib
 import io
+import json
 import pickle
 import subprocess
 import sys
@@ -159,7 +160,8 @@ def main() -> None:
     arguments = parser.parse_args()
     with tempfile.TemporaryDirectory() as folder:
         state = convert_lpips_alex(fetch(FEATURES, Path(folder)), fetch(HEADS, Path(folder)))
-    save_file(state, arguments.out, metadata=metadata())
+    # One key, because the order of several is not the same in every run.
+    save_file(state, arguments.out, metadata={"record": json.dumps(metadata(), sort_keys=True)})
     arguments.out.chmod(0o644)  # safetensors writes files only their owner can read
     print(f"wrote {arguments.out}, {arguments.out.stat().st_size / 1e6:.1f} MB")
 

@@ -74,7 +74,6 @@ class LPIPS(nn.Module):
         self.register_buffer("scale", torch.tensor(INPUT_SCALE)[:, None, None], persistent=False)
         self.load_state_dict({name: tensor.float() for name, tensor in load_file(weights).items()})
         self.requires_grad_(False)
-        self.features.to(memory_format=torch.channels_last)  # a quarter faster on a CPU
         self.eval()
 
     def forward(
@@ -105,6 +104,7 @@ class LPIPS(nn.Module):
 
     def _activations(self, images: Tensor) -> list[Tensor]:
         """Return the five rectified feature maps of images in [-1, 1]."""
+        # A quarter faster on a CPU than the default layout.
         x = ((images - self.shift) / self.scale).contiguous(memory_format=torch.channels_last)
         activations = []
         for index, convolution in enumerate(self.features):

@@ -172,7 +172,7 @@ def fit(
         json.dump({**record, "folder": str(output.folder)}, sys.stdout, indent=2)
         print()
     if not quiet:
-        summarise(refined, record, output, paths, estimated=position is None)
+        summarise(record, paths, estimated=position is None)
 
 
 def parse_point(option: str, text: str, otherwise: str) -> tuple[float, float, float]:
@@ -261,14 +261,17 @@ def run(arguments: Sequence[str]) -> int:
         module, _, attribute = SUBCOMMANDS[arguments[0]].partition(":")
         command, name = getattr(import_module(module), attribute), f"refine {arguments.pop(0)}"
     try:
-        return command(arguments, prog_name=name, standalone_mode=False) or 0
-    except KeyboardInterrupt:
-        return _interrupted()
+        code = command(arguments, prog_name=name, standalone_mode=False) or 0
+    except (KeyboardInterrupt, typer.Abort):
+        code = INTERRUPTED
     except Exception as error:
         if (sentence := _sentence(error)) is None:
             raise
         print(f"refine: {sentence}", file=sys.stderr)
         return USER_ERROR
+    if code == INTERRUPTED:
+        print("refine: interrupted; nothing was written.", file=sys.stderr)
+    return int(code)
 
 
 def _sentence(error: Exception) -> str | None:
@@ -286,11 +289,6 @@ def _sentence(error: Exception) -> str | None:
     if checkpoints is not None and isinstance(error, checkpoints.CheckpointError):
         return " ".join(str(error).split()) + "."
     return None
-
-
-def _interrupted() -> int:
-    print("refine: interrupted; nothing was written.", file=sys.stderr)
-    return INTERRUPTED
 
 
 def main() -> None:

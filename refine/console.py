@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
+import os
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
-
-if TYPE_CHECKING:
-    from refine.refiner import Refined
-    from refine.result import Output
+from typing import Any
 
 
 @contextmanager
@@ -38,26 +35,32 @@ def progress_bar(*, shown: bool) -> Iterator[Callable[[str, int, int, float], No
         yield tell
 
 
-def summarise(
-    refined: Refined, record: dict[str, Any], output: Output, paths: dict[str, Path], *, estimated: bool
-) -> None:
-    """Say on standard error what was done and written: several lines to a person, one to a log."""
+def summarise(record: dict[str, Any], paths: dict[str, Path], *, estimated: bool) -> None:
+    """Say what was done and written: some lines to a person, one to a log.
+
+    Args:
+        record: of `refine.result.describe`.
+        paths: every file written.
+        estimated: whether the light was not given.
+    """
+    source, notes = record["photo"]["source"], "; ".join(record["photo"]["notes"])
     where = ", ".join(f"{value:.2f}" for value in record["light"]["position"])
     light = f"light {'estimated' if estimated else 'given'} at ({where})"
-    errors = ["unknown" if value is None else f"{value:.4f}" for value in list(record["rmse"].values())[1:]]
-    count = refined.recipe.iterations
-    fit = (
-        f"re-rendering RMSE {errors[0]} -> {errors[1]} in {count} iterations"
-        if count
-        else f"RMSE {errors[0]}, not refined"
-    )
-    notes = "; ".join(refined.notes)
+    before, after = (_number(record["rmse"][name]) for name in ("initialization", "refined"))
+    count = sum(stage["iterations"] for stage in record["recipe"]["stages"])
+    error = f"re-rendering RMSE {before} -> {after} in {count} iterations"
+    if count == 0:
+        error = f"re-rendering RMSE {before}, not refined"
+    folder = paths["json"].parent
     if not sys.stderr.isatty():
-        said = f"{refined.source}: {notes}; {light}; {fit}; wrote {len(paths)} files to {output.folder}"
-        print(said, file=sys.stderr)
+        print(f"{source}: {notes}; {light}; {error}; wrote {len(paths)} files to {folder}", file=sys.stderr)
         return
-    seconds = sum(refined.seconds.values())
-    print(f"{refined.source}: {notes}", file=sys.stderr)
-    print(f"{light}; {fit}, {seconds:.0f} s", file=sys.stderr)
-    print(f"wrote {output.folder}/", file=sys.stderr)
+    seconds = sum(record["seconds"].values())
+    print(f"{source}: {notes}", file=sys.stderr)
+    print(f"{light}; {error}, {seconds:.0f} s", file=sys.stderr)
+    print(f"wrote to {folder}{os.sep}", file=sys.stderr)
     print("  " + "  ".join(path.name for path in paths.values()), file=sys.stderr)
+
+
+def _number(value: float | None) -> str:
+    return "unknown" if value is None else f"{value:.4f}"

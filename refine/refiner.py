@@ -225,7 +225,7 @@ def run_stages(
             capture,
             geometry,
             iterations=stage.iterations,
-            learning_rate=stage.learning_rate,
+            rates=stage.rates.moving(),
             progress=tell,
         )
         finished += stage.iterations

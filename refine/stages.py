@@ -12,12 +12,25 @@ from refine.light import LightFit
 
 
 @dataclass(frozen=True)
+class Rates:
+    """Adam's learning rate of each map's parameters (see `refine.parametrization`); 0 keeps a map as it is."""
+
+    normal: float = 0.0
+    diffuse: float = 0.0
+    roughness: float = 0.0
+    specular: float = 0.0
+
+    def moving(self) -> dict[str, float]:
+        """Return the rates that are not zero, by map name."""
+        return {name: rate for name in MAPS if (rate := getattr(self, name)) > 0.0}
+
+
+@dataclass(frozen=True)
 class GlobalStage:
     """Move some maps as a whole: every pixel by the gradient averaged over all pixels (paper Sec. 6.1)."""
 
     iterations: int = 100
-    learning_rate: float = 0.05
-    maps: tuple[str, ...] = ("roughness", "specular")
+    rates: Rates = Rates(roughness=0.02, specular=0.02)
 
     @property
     def name(self) -> str:
@@ -26,7 +39,7 @@ class GlobalStage:
 
     def offsets(self, height: int, width: int) -> dict[str, torch.Tensor]:
         """Return the zero offsets that this stage optimises: one per channel."""
-        return {name: torch.zeros(1, _parameters(name), 1, 1) for name in self.maps}
+        return {name: torch.zeros(1, _parameters(name), 1, 1) for name in self.rates.moving()}
 
 
 @dataclass(frozen=True)
@@ -34,8 +47,7 @@ class PixelStage:
     """Move some maps pixel by pixel."""
 
     iterations: int = 400
-    learning_rate: float = 0.03
-    maps: tuple[str, ...] = MAPS
+    rates: Rates = Rates(normal=0.01, diffuse=0.03, roughness=0.005, specular=0.005)
 
     @property
     def name(self) -> str:
@@ -44,7 +56,7 @@ class PixelStage:
 
     def offsets(self, height: int, width: int) -> dict[str, torch.Tensor]:
         """Return the zero offsets that this stage optimises: one per channel and pixel."""
-        return {name: torch.zeros(1, _parameters(name), height, width) for name in self.maps}
+        return {name: torch.zeros(1, _parameters(name), height, width) for name in self.rates.moving()}
 
 
 Stage = GlobalStage | PixelStage

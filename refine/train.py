@@ -18,8 +18,8 @@ from nets.data.pool import MaterialPool, decode
 from nets.generator import NARROW_GENERATOR, Generator, GeneratorConfig
 from nets.trainer import Phase, Trainer, TrainerConfig, TrainingBatch
 
-POOL_SHARES = {"procedural": 0.5, "pbr": 0.5}
-"""How often a training material is procedural, how often a scanned or baked one."""
+POOL_SHARES = {"procedural": 0.5, "pbr": 0.3, "infinigen": 0.2}
+"""How often a training material is generated here, scanned, or baked with infinigen (many of those are plain)."""
 
 
 def batch_source(

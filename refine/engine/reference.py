@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 
 import torch
@@ -14,6 +15,9 @@ from refine.parametrization import Parameters
 
 ADAM_BETAS = (0.9, 0.999)
 
+FINAL_RATE = 0.1
+"""Share of the learning rates that is left at the last iteration."""
+
 Progress = Callable[[int, float], None]
 """Called after every iteration with its number (from 1) and loss."""
 
@@ -25,7 +29,7 @@ def descend(
     geometry: Geometry,
     *,
     iterations: int,
-    learning_rate: float,
+    rates: dict[str, float],
     progress: Progress | None = None,
 ) -> tuple[Parameters, list[float]]:
     """Minimise the photo's distance over additive offsets to some maps' parameters.
@@ -37,16 +41,17 @@ def descend(
         capture: the photo to explain.
         geometry: of the light and camera, fixed.
         iterations: Adam steps.
-        learning_rate: Adam's, decayed along a half cosine to a tenth.
+        rates: Adam's learning rate by map name, decayed along a half cosine to `FINAL_RATE` of it.
         progress: told of every iteration.
 
     Returns:
         The parameters with the lowest loss seen, and the loss before every step and after the last.
     """
     moving = {name: offset.detach().clone().requires_grad_(True) for name, offset in offsets.items()}
-    optimizer = torch.optim.Adam(list(moving.values()), lr=learning_rate, betas=ADAM_BETAS)
-    schedule = torch.optim.lr_scheduler.CosineAnnealingLR(
-        optimizer, T_max=max(1, iterations), eta_min=learning_rate / 10.0
+    groups = [{"params": [tensor], "lr": rates[name]} for name, tensor in moving.items()]
+    optimizer = torch.optim.Adam(groups, betas=ADAM_BETAS)
+    schedule = torch.optim.lr_scheduler.LambdaLR(
+        optimizer, lambda step: FINAL_RATE + (1.0 - FINAL_RATE) * math.cos(math.pi / 2 * step / max(1, iterations))
     )
 
     def distance() -> Tensor:

@@ -28,9 +28,9 @@ from refine.refiner import Refined
 DPI = 100
 TILE = 256
 """Longer side of every picture on the sheet, pixels."""
-SMALLEST_SLOT = (212, 150)
+SMALLEST_SLOT = (232, 150)
 """Width and height at least reserved for a picture, so that captions and plots stay readable."""
-MARGIN, GAP, HEADER, CAPTION = 20, 14, 44, 38
+MARGIN, GAP, HEADER, CAPTION, LINE = 20, 14, 44, 38, 15
 COLUMNS, ROWS = 5, 4
 FONT = 9.0
 
@@ -124,24 +124,24 @@ class _Sheet:
         return self.figure.add_axes(box)
 
     def words(
-        self, left: float, top: float, words: str, size: float = FONT, color: str = INK, **style: Any
+        self, left: float, base: float, words: str, size: float = FONT, color: str = INK, **style: Any
     ) -> None:
-        """Write text whose top left is a pixel."""
+        """Write one line that begins at a pixel; `base` is its base line."""
         self.figure.text(
             left / self.width,
-            1.0 - top / self.height,
+            1.0 - base / self.height,
             words.replace("$", r"\$"),
             fontsize=size,
             color=color,
-            va="top",
+            va="baseline",
             ha="left",
             **style,
         )
 
     def title(self, name: str, subtitle: str) -> None:
         """Write the head line."""
-        self.words(MARGIN, MARGIN - 4, _shortened(name, 90), 13.0, fontweight="bold")
-        self.words(MARGIN, MARGIN + 19, subtitle, color=FAINT)
+        self.words(MARGIN, MARGIN + 9, _shortened(name, 90), 13.0, fontweight="bold")
+        self.words(MARGIN, MARGIN + 30, subtitle, color=FAINT)
 
     def picture(
         self,
@@ -161,8 +161,8 @@ class _Sheet:
         axes.set_axis_off()
         if light is not None:
             _mark(axes, light, self.tile)
-        self.words(left, top + height + 4, caption, fontweight="bold")
-        self.words(left, top + height + 19, fact, color=FAINT)
+        self.words(left, top + height + 15, caption, fontweight="bold")
+        self.words(left, top + height + 30, fact, color=FAINT)
 
     def plot(self, first: int, last: int) -> Axes:
         """Return axes over the last column's slots of some rows."""
@@ -175,14 +175,15 @@ class _Sheet:
         left, top = self.corner(row, COLUMNS - 1)
         width = int(self.slot[0] / 6.3)
         wrapped = [part for line in lines for part in textwrap.wrap(line, width, subsequent_indent="   ")]
-        room = (self.slot[1] + CAPTION) // 15
+        room = (self.slot[1] + CAPTION) // LINE
         if len(wrapped) > room:
             wrapped = [*wrapped[: room - 1], "… (all of it in the .json)"]
-        self.words(left, top, "\n".join(wrapped), linespacing=1.15)
+        for number, line in enumerate(wrapped):
+            self.words(left, top + 10 + number * LINE, line)
 
 
 def _mark(axes: Axes, light: tuple[float, float, float], tile: tuple[int, int]) -> None:
-    # A disc where the light hangs over the surface, or a triangle at the edge beyond which it does.
+    # A ring where the light hangs over the surface, or a triangle at the edge beyond which it does.
     height, width = tile
     half = max(height, width) / 2
     x, y = width / 2 + light[0] * half - 0.5, height / 2 - light[1] * half - 0.5
@@ -191,15 +192,11 @@ def _mark(axes: Axes, light: tuple[float, float, float], tile: tuple[int, int]) 
     marker = "o"
     if max(beyond) > 8.0:
         marker = (">" if x > inside_x else "<") if beyond[0] >= beyond[1] else ("v" if y > inside_y else "^")
-    axes.plot(
-        [inside_x],
-        [inside_y],
-        marker=marker,
-        markersize=9,
-        color="#ffd84a",
-        markeredgecolor="black",
-        clip_on=False,
-    )
+    for color, thickness in (("black", 4.0), ("#ffd84a", 1.8)):
+        axes.plot(
+            [inside_x], [inside_y], marker, markersize=10, markerfacecolor="none", markeredgecolor=color,
+            markeredgewidth=thickness,
+        )  # fmt: skip
     axes.set_xlim(-0.5, width - 0.5)
     axes.set_ylim(height - 0.5, -0.5)
 
@@ -241,9 +238,9 @@ def _draw_losses(axes: Axes, losses: dict[str, list[float]]) -> None:
     axes.set_yscale("log")
     axes.yaxis.set_major_formatter(lambda value, _: f"{value:g}")
     axes.set_xlim(0, max(1, start))
-    highest = max([*before, *(value for _, values in stages for value in values)])
-    axes.set_ylim(top=highest * 1.35)
     low, high = axes.get_ylim()
+    high *= (high / low) ** (0.08 + 0.04 * len(stages))  # room for the legend
+    axes.set_ylim(low, high)
     labelled = "123456789" if high < 4.0 * low else "235"
     axes.yaxis.set_minor_formatter(lambda value, _: f"{value:g}" if f"{value:.0e}"[0] in labelled else "")
     axes.tick_params(axis="y", which="minor", labelsize=8.0, colors=FAINT)
@@ -261,7 +258,7 @@ def _map_picture(material: SVBRDF, name: str) -> tuple[Tensor, str]:
         return tensor * 0.5 + 0.5, f"mean tilt {tilt:.1f}°, green is up"
     if name == "roughness":
         return tensor, f"raw, mean {mean[0]:.2f}"
-    return _seen(tensor), f"sRGB, linear mean {_numbers(mean)}"
+    return _seen(tensor), f"sRGB, mean {_numbers(mean)}"
 
 
 def _novel_positions(height: int, width: int) -> list[tuple[float, float, float]]:

@@ -5,6 +5,7 @@ heads, torchvision's fp32 AlexNet) on the pictures that `picture` draws: analyti
 """
 
 import io
+import json
 import pickle
 from pathlib import Path
 
@@ -120,7 +121,7 @@ def test_missing_weights_name_the_command(tmp_path: Path) -> None:
 
 def test_the_shipped_file_names_its_sources_and_licences() -> None:
     with safe_open(LPIPS_ALEX, framework="pt") as file:
-        record = file.metadata()
+        record = json.loads(file.metadata()["record"])
     assert record["features_sha256"] == FEATURES.member_sha256
     assert record["heads_archive_sha256"] == HEADS.archive_sha256
     notice = (LPIPS_ALEX.parent / "NOTICE").read_text()

@@ -38,7 +38,7 @@ CAMERAS = {
     "perspective aside": Camera("perspective", (0.7, -0.4, 1.5)),
     "collocated": Camera("collocated"),
 }
-SIZES = [(4, 4), (3, 6), (7, 2), (1, 5)]
+SIZES = [(3, 3), (2, 5), (5, 1)]
 
 Vector = tuple[float, float, float]
 
@@ -368,7 +368,9 @@ def test_a_mirror_seen_straight_on_reflects_no_more_than_it_receives(roughness: 
     view = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)[None, :, None, None].expand_as(light)
     mirror = SVBRDF.constant(20_000, 1, diffuse=1.0, roughness=roughness, specular=1.0, dtype=torch.float64)
     reflected = float((cook_torrance(mirror, geometry_of(light, view))[0, 0] * light[0, 2] * solid).sum())
-    assert 0.4 < reflected <= 1.0 + 1e-3
+    assert 0.3 < reflected <= 1.0 + 1e-3
+    if roughness == 1.0:  # D = 1/pi and G = 2/(1 + n.l): the integral has a closed form
+        assert reflected == pytest.approx(1.0 - math.log(2.0), abs=1e-4)
 
 
 # --- Gradients --------------------------------------------------------------------------------------------
@@ -377,7 +379,7 @@ def test_a_mirror_seen_straight_on_reflects_no_more_than_it_receives(roughness: 
 @pytest.mark.parametrize("falloff", ["none", "inverse_square"])
 @pytest.mark.parametrize("camera", CAMERAS.values(), ids=CAMERAS)
 def test_gradients_in_maps_light_and_intensity(camera: Camera, falloff) -> None:  # type: ignore[no-untyped-def]
-    start = Parameters.from_svbrdf(random_svbrdf(1, 2, 3, dtype=torch.float64))
+    start = Parameters.from_svbrdf(random_svbrdf(1, 1, 3, dtype=torch.float64))
     light = random_light(seed=2, dtype=torch.float64)
 
     def radiance(normal: Tensor, diffuse: Tensor, roughness: Tensor, specular: Tensor, *lit: Tensor) -> Tensor:
@@ -402,9 +404,9 @@ def test_gradients_in_the_raw_maps() -> None:
 CORNER_SIZE = (3, 4)
 PIXEL = surface_points(*CORNER_SIZE)[:, 1, 2].tolist()
 
-roughnesses = st.sampled_from([1e-3, 0.01, 0.03, 0.031, 0.1, 1.0]) | st.floats(1e-3, 1.0, width=32)
-unit_interval = st.sampled_from([0.0, 0.04, 1.0]) | st.floats(0.0, 1.0, width=32)
-normal_heights = st.sampled_from([0.0, 1e-7, 1e-4, 0.02, 0.5, 1.0]) | st.floats(0.0, 1.0, width=32)
+roughnesses = st.sampled_from([1e-3, 0.01, 0.03, 0.031, 0.1, 1.0]) | st.floats(1e-3, 1.0)
+unit_interval = st.sampled_from([0.0, 0.04, 1.0]) | st.floats(0.0, 1.0)
+normal_heights = st.sampled_from([0.0, 1e-7, 1e-4, 0.02, 0.5, 1.0]) | st.floats(0.0, 1.0)
 light_heights = st.sampled_from([1e-3, 0.01, 0.2, 2.14, 50.0]) | st.floats(1e-3, 20.0)
 light_sides = st.sampled_from([-1.0, 0.0, PIXEL[0], PIXEL[1], 1.0, 1.5]) | st.floats(-2.0, 2.0)
 
