@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import pickle
+import warnings
 import zipfile
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -103,7 +104,7 @@ def read_record(name: str | Path) -> Record:
         if header.pop("format") != FORMAT:
             raise KeyError
         return Record(**{**header, "architecture": GeneratorConfig(**header["architecture"])})
-    except (KeyError, TypeError, ValueError):
+    except (AttributeError, KeyError, TypeError, ValueError):
         raise CheckpointError(
             f"{path}: a safetensors file, but not a generator of this library; give one written by refine-train"
         ) from None
@@ -111,8 +112,7 @@ def read_record(name: str | Path) -> Record:
 
 def _load_own(path: Path) -> Generator:
     record = read_record(path)
-    with torch.device("meta"):
-        network = Generator(record.architecture)
+    network = _without_weights(path, record.architecture.as_dict())
     expected = {name: tuple(tensor.shape) for name, tensor in network.state_dict().items()}
     with safe_open(path, "pt") as file:
         found = {name: tuple(file.get_slice(name).get_shape()) for name in file.keys()}  # noqa: SIM118
@@ -124,7 +124,9 @@ def _load_own(path: Path) -> Generator:
 
 def _load_authors(path: Path) -> Generator:
     try:
-        state = torch.load(path, map_location="cpu", weights_only=True)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # about pickles that are refused anyway
+            state = torch.load(path, map_location="cpu", weights_only=True)
     except (pickle.UnpicklingError, RuntimeError, EOFError, zipfile.BadZipFile, ValueError, KeyError) as error:
         reason = str(error).splitlines()[0] if str(error) else type(error).__name__
         raise CheckpointError(
@@ -136,12 +138,22 @@ def _load_authors(path: Path) -> Generator:
     renamed = from_authors_names({str(name): value for name, value in state.items()})
     first = renamed.get("encoder.0.weight")
     width = int(first.shape[0]) if first is not None and first.ndim == 4 else PAPER_GENERATOR.width
-    with torch.device("meta"):
-        network = Generator(GeneratorConfig(width=width))
+    network = _without_weights(path, {"width": width})
     expected = {name: tuple(tensor.shape) for name, tensor in network.state_dict().items()}
     _check_shapes(path, expected, {name: tuple(tensor.shape) for name, tensor in renamed.items()})
     network.load_state_dict({name: value.float() for name, value in renamed.items()}, assign=True)
     return network
+
+
+def _without_weights(path: Path, architecture: dict[str, int]) -> Generator:
+    try:
+        with torch.device("meta"):
+            return Generator(GeneratorConfig(**architecture))
+    except (RuntimeError, TypeError, ValueError):
+        raise CheckpointError(
+            f"{path}: another architecture, no generator can be built as {architecture}; "
+            "load it with its own code"
+        ) from None
 
 
 def authors_names(config: GeneratorConfig = PAPER_GENERATOR) -> dict[str, str]:
@@ -191,5 +203,3 @@ def _check_shapes(
     unknown = sorted(set(found) - set(expected))
     if unknown:
         raise CheckpointError(f"{path}: another architecture, {unknown[0]} is unknown here; load it with its own code")
-
-

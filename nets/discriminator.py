@@ -7,6 +7,7 @@ features become losses (LSGAN, feature matching) is said in `losses/adversarial.
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass
+from itertools import pairwise
 
 import torch
 from jaxtyping import Float
@@ -94,11 +95,12 @@ class PatchDiscriminator(nn.Module):
         widths = (config.channels + config.condition_channels, *config.widths)
         self.convolutions = nn.ModuleList(
             nn.Conv2d(inputs, outputs, KERNEL, stride=2 if layer < config.layers else 1, padding=PADDING)
-            for layer, (inputs, outputs) in enumerate(zip(widths[:-1], widths[1:], strict=True))
+            for layer, (inputs, outputs) in enumerate(pairwise(widths))
         )
         self.norms = nn.ModuleList(nn.InstanceNorm2d(width) for width in config.widths[1:-1])
-        for convolution in self.convolutions:
-            nn.init.normal_(convolution.weight, std=WEIGHT_DEVIATION)
+        for name, parameter in self.named_parameters():
+            if name.endswith("weight"):
+                nn.init.normal_(parameter, std=WEIGHT_DEVIATION)
 
     def forward(self, x: Float[Tensor, "b c h w"]) -> Judgement:
         """Judge every patch of conditioned images."""

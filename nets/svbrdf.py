@@ -106,7 +106,7 @@ class SVBRDF:
         """
         shape = (self.batch, *self.size)
         for name in (field.name for field in fields(self)):
-            tensor = getattr(self, name)
+            tensor = getattr(self, name).detach()
             expected = (shape[0], CHANNELS[name], *shape[1:])
             if tuple(tensor.shape) != expected:
                 raise ValueError(f"{name} has shape {tuple(tensor.shape)}, expected {expected}")
@@ -118,11 +118,12 @@ class SVBRDF:
             if low < 0.0 or high > 1.0 or (name == "roughness" and low == 0.0):
                 interval = "(0, 1]" if name == "roughness" else "[0, 1]"
                 raise ValueError(f"{name} lies in [{low:.4g}, {high:.4g}], expected {interval}")
-        length = torch.linalg.vector_norm(self.normal, dim=1)
+        normal = self.normal.detach()
+        length = torch.linalg.vector_norm(normal, dim=1)
         if float((length - 1.0).abs().max()) > UNIT_TOLERANCE:
             raise ValueError(
                 f"normals must be unit vectors, lengths lie in [{length.min():.4g}, {length.max():.4g}]"
             )
-        if float(self.normal[:, 2].min()) < 0.0:
-            raise ValueError(f"normals must face the viewer (z >= 0), lowest z is {self.normal[:, 2].min():.4g}")
+        if float(normal[:, 2].min()) < 0.0:
+            raise ValueError(f"normals must face the viewer (z >= 0), lowest z is {normal[:, 2].min():.4g}")
         return self

@@ -23,7 +23,6 @@ from refine.errors import UserError
 
 if TYPE_CHECKING:
     from nets.render import PointLight
-    from refine.photo import ColorSpaceChoice
 
 USER_ERROR, INTERRUPTED = 2, 130
 
@@ -58,10 +57,11 @@ def _output(metavar: str, help: str, **more: Any) -> Any:
     return _option(metavar, help, "Output", **more)
 
 
-def _version(asked: bool) -> None:
+def _version(asked: bool) -> bool:
     if asked:
         print(f"refine {__version__}")
         raise typer.Exit
+    return asked
 
 
 @app.command()
@@ -121,17 +121,18 @@ def fit(
     import torch
 
     from nets.render import Camera, PointLight
-    from refine.photo import read_photo
+    from refine.photo import ColorSpaceChoice, read_photo
     from refine.refiner import Refiner
     from refine.result import MAP_FORMATS, Output, describe, describe_checkpoint, write_result
     from refine.stages import RECIPES
 
+    _choose("--color-space", color_space, get_args(ColorSpaceChoice))
     _choose("--recipe", recipe, tuple(RECIPES))
     _choose("--format", format, tuple(MAP_FORMATS))
     _require_device(device)
     if threads is not None:
         torch.set_num_threads(threads)
-    read = read_photo(photo, color_space=cast("ColorSpaceChoice", color_space))
+    read = read_photo(photo, color_space=cast(ColorSpaceChoice, color_space))
     output = Output(
         out if out is not None else Path(f"{photo.stem}_material"),
         photo.stem,

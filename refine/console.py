@@ -59,7 +59,8 @@ def summarise(record: dict[str, Any], paths: dict[str, Path], *, estimated: bool
     print(f"{source}: {notes}", file=sys.stderr)
     print(f"{light}; {error}, {seconds:.0f} s", file=sys.stderr)
     print(f"wrote to {folder}{os.sep}", file=sys.stderr)
-    print("  " + "  ".join(path.name for path in paths.values()), file=sys.stderr)
+    for path in paths.values():
+        print(f"  {path.name}", file=sys.stderr)
 
 
 def _number(value: float | None) -> str:

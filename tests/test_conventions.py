@@ -1,14 +1,18 @@
 """`docs/conventions.md`, executed: every statement of the page is quoted here and checked against the code.
 
 `@states("C01", "...")` ties a test to a statement. What goes wrong in detail is for the tests of each room;
-here each convention is checked once, from outside, with its formula written out again.
+here each convention is checked once, from outside, with its formula written out again. At the end: the
+constants of `docs/methods.md` and the modules of `docs/architecture.md`.
 """
 
 from __future__ import annotations
 
+import ast
 import math
 import re
 from collections.abc import Callable
+from importlib import import_module
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -27,7 +31,15 @@ from nets.data.augment import Pose, view_tile
 from nets.data.images import resize
 from nets.data.pbr import read_pbr_folder
 from nets.data.strips import read_strip, write_strip
-from nets.generator import Generator, GeneratorConfig, light_from_output, light_to_output, maps_to_svbrdf
+from nets.generator import (
+    NARROW_GENERATOR,
+    PAPER_GENERATOR,
+    Generator,
+    GeneratorConfig,
+    light_from_output,
+    light_to_output,
+    maps_to_svbrdf,
+)
 from nets.render import (
     PRESETS,
     Camera,
@@ -51,7 +63,8 @@ from refine.maps import MapFormat, NormalConvention, read_maps, write_maps
 from refine.photo import photo_from_array, read_photo, resize_photo
 from tests.helpers import assert_close, random_light, random_svbrdf, seeded
 
-PAGE = Path(__file__).parent.parent / "docs" / "conventions.md"
+ROOT = Path(__file__).parent.parent
+PAGE, METHODS, ARCHITECTURE = (ROOT / "docs" / f"{n}.md" for n in ("conventions", "methods", "architecture"))
 TINY = GeneratorConfig(width=4, levels=2, deep_multiplier=2)
 ORTHOGRAPHIC = Camera("orthographic")
 
@@ -170,7 +183,7 @@ def with_map(name: str, value: Tensor) -> SVBRDF:
 
 
 def refused(name: str, values: float | tuple[float, ...]) -> bool:
-    """Whether a map of that value everywhere is refused by name (normals are not named but described)."""
+    """Whether a map of that value everywhere is refused, by name."""
     channels = (
         torch.tensor(values).expand(CHANNELS[name]) if isinstance(values, float) else torch.tensor(values)
     )
@@ -178,8 +191,7 @@ def refused(name: str, values: float | tuple[float, ...]) -> bool:
     try:
         material.validate()
     except ValueError as error:
-        assert name in str(error)
-        return True
+        return name in str(error)
     return False
 
 
@@ -214,8 +226,8 @@ def test_roughness_map() -> None:
     assert SVBRDF.constant(2, 5, batch=3).validate().roughness.shape == (3, 1, 2, 5)
     assert [refused("roughness", value) for value in (0.0, 1e-4, 1.0, 1.01)] == [True, False, False, True]
     # Straight above, D = 1 / (pi alpha^2) and G = F = 1: the peak tells alpha.
-    mirror = SVBRDF.constant(1, 1, diffuse=0.0, specular=1.0, roughness=0.5)
-    peak = float(render(mirror, PointLight.at((0.0, 0.0, 2.0)), ORTHOGRAPHIC)[0, 0])
+    bare = SVBRDF.constant(1, 1, diffuse=0.0, specular=1.0, roughness=0.5)
+    peak = float(render(bare, PointLight.at((0.0, 0.0, 2.0)), ORTHOGRAPHIC)[0, 0])
     alpha = 1.0 / math.sqrt(4.0 * peak)
     assert alpha == pytest.approx(0.5**2, rel=1e-4)
 
@@ -251,8 +263,8 @@ def test_normals_turn_with_the_picture() -> None:
     quarter = Pose(torch.tensor([math.pi / 2]), torch.tensor([False]), whole, centre)
     turned = render(view_tile(material, quarter, 8), PointLight.at((-0.9, 0.5, 1.6)))
     assert_close(turned, torch.rot90(photo, 1, dims=(2, 3)), atol=1e-4, rtol=1e-3)
-    mirror = Pose(torch.zeros(1), torch.tensor([True]), whole, centre)
-    mirrored = render(view_tile(material, mirror, 8), PointLight.at((-0.5, 0.9, 1.6)))
+    flip = Pose(torch.zeros(1), torch.tensor([True]), whole, centre)
+    mirrored = render(view_tile(material, flip, 8), PointLight.at((-0.5, 0.9, 1.6)))
     assert_close(mirrored, photo.flip(3), atol=1e-4, rtol=1e-3)
 
 
@@ -1007,7 +1019,7 @@ def test_map_rmse() -> None:
 def test_test_photo(tmp_path: Path) -> None:
     material = random_svbrdf(1, 64, 64, roughness=(0.1, 0.2))
     photo, light = input_photo(material)
-    assert CAMERA == Camera("perspective", (0.0, 0.0, 2.14))
+    assert Camera("perspective", (0.0, 0.0, 2.14)) == CAMERA
     assert_close(light.position, torch.tensor([[0.0, 0.0, 2.14]]))
     assert (light.intensity.tolist(), light.falloff) == ([[1.0, 1.0, 1.0]], "none")
     rendering = render(material, PointLight.at((0.0, 0.0, 2.14)))
@@ -1058,3 +1070,58 @@ def test_rerendering_rmse() -> None:
         float((encoded(rendering) - encoded(photo)).movedim(1, -1)[unsaturated[:, 0]].square().mean().sqrt()),
         rel=1e-3,
     )
+
+
+# The other pages
+
+CONSTANTS = re.findall(
+    r"^\| `((?:nets|losses|refine|eval)\.[\w.]+)` \| `(.+?)` \|", METHODS.read_text(), re.M
+)
+
+
+def constant(path: str) -> Any:
+    """Return what a dotted path names: an attribute of an attribute ... of a module."""
+    parts = path.split(".")
+    module = next(".".join(parts[:n]) for n in range(2, len(parts)) if not is_module(parts[: n + 1]))
+    value: Any = import_module(module)
+    for name in parts[len(module.split(".")) :]:
+        value = getattr(value, name)
+    return value
+
+
+def is_module(parts: list[str]) -> bool:
+    try:
+        return find_spec(".".join(parts)) is not None
+    except ModuleNotFoundError:  # the last but one is a module, not a package
+        return False
+
+
+@pytest.mark.parametrize(("path", "value"), CONSTANTS, ids=[path for path, _ in CONSTANTS])
+def test_constants_of_the_methods_page(path: str, value: str) -> None:
+    expected, found = ast.literal_eval(re.sub(r"\binf\b", "1e999", value)), constant(path)
+    if isinstance(expected, float):
+        expected = pytest.approx(expected, rel=1e-5)
+    assert found == expected, f"docs/methods.md says {value}, the code {found}"
+
+
+def test_no_row_of_the_methods_page_is_overlooked() -> None:
+    rows = [line for line in METHODS.read_text().splitlines() if line.startswith("| `")]
+    assert len(rows) == len(CONSTANTS) > 80
+    assert len({path for path, _ in CONSTANTS}) == len(CONSTANTS)
+
+
+def test_modules_of_the_architecture_page() -> None:
+    listed = re.findall(r"^\| `([\w/]+\.py)` \|", ARCHITECTURE.read_text(), re.M)
+    assert len(listed) == len(set(listed))
+    rooms = ("nets", "losses", "refine", "eval")
+    files = (path for room in rooms for path in (ROOT / room).rglob("*.py") if path.name != "__init__.py")
+    assert set(listed) == {path.relative_to(ROOT).as_posix() for path in files}
+
+
+def test_sizes_of_the_architecture_page() -> None:
+    for config, words in ((PAPER_GENERATOR, "231.8 M"), (NARROW_GENERATOR, "3.67 M")):
+        with torch.device("meta"):
+            count = sum(parameter.numel() for parameter in Generator(config).parameters())
+        number, digits = float(words.split()[0]), len(words.split()[0].partition(".")[2])
+        assert round(count / 1e6, digits) == number
+        assert words in ARCHITECTURE.read_text()

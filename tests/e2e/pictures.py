@@ -1,4 +1,4 @@
-"""Pictures that end-to-end tests run on: a rendered flash photo, and image files as other programs write them."""
+"""Pictures that end-to-end tests run on: a rendered flash photo, and image files of any kind."""
 
 from __future__ import annotations
 

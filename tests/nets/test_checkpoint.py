@@ -344,7 +344,7 @@ SPOILED = [
     (_unknown, r"another architecture, zz\.top is unknown here"),
     (_impossible, "not a generator of this library"),
     (_not_a_number, "not a generator of this library"),
-    (_enormous, "not a generator of this library"),
+    (_enormous, "another architecture, no generator can be built"),
     (_unknown_option, "not a generator of this library"),
     (_other_format, "not a generator of this library"),
     (_no_architecture, "not a generator of this library"),

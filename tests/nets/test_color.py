@@ -54,7 +54,7 @@ def test_gamma_gradients() -> None:
 
 
 def test_network_input_spans_minus_one_to_one() -> None:
-    photo = torch.tensor([0.0, 0.5 ** 2.2, 1.0, 3.0])[None, None, None].expand(1, 3, 1, 4)
+    photo = torch.tensor([0.0, 0.5**2.2, 1.0, 3.0])[None, None, None].expand(1, 3, 1, 4)
     assert_close(to_network_input(photo)[0, 0, 0], torch.tensor([-1.0, 0.0, 1.0, 1.0]), atol=4e-3)
 
 

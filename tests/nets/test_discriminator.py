@@ -28,9 +28,7 @@ def test_the_papers_layers_are_pix2pixhds() -> None:
     assert sum(parameter.numel() for parameter in network.scales[0].parameters()) == 2_767_809
 
 
-@pytest.mark.parametrize(
-    ("side", "patches"), [(256, [35, 19, 11]), (128, [19, 11, 7]), (100, [16, 10, 6])]
-)
+@pytest.mark.parametrize(("side", "patches"), [(256, [35, 19, 11]), (128, [19, 11, 7]), (100, [16, 10, 6])])
 def test_patches_per_scale(side: int, patches: list[int]) -> None:
     network = Discriminator(DiscriminatorConfig(width=1, scales=3))
     judgements = network(images(side, batch=1), images(side, batch=1))
@@ -166,7 +164,9 @@ def test_wrong_inputs_are_named(candidate: Tensor, condition: Tensor | None, mes
         Discriminator(SMALL)(candidate, condition)
 
 
-@pytest.mark.parametrize("wrong", [{"scales": 0}, {"layers": 0}, {"width": 0}, {"channels": 0}, {"condition_channels": -1}])
+@pytest.mark.parametrize(
+    "wrong", [{"scales": 0}, {"layers": 0}, {"width": 0}, {"channels": 0}, {"condition_channels": -1}]
+)
 def test_impossible_shapes_are_refused(wrong: dict[str, int]) -> None:
     with pytest.raises(ValueError, match="not a discriminator"):
         DiscriminatorConfig(**wrong)

@@ -37,7 +37,8 @@ def test_channels_and_back() -> None:
 
 
 @pytest.mark.parametrize(
-    ("index", "kept"), [(0, [0]), (2, [2]), (-1, [2]), (-2, [1]), (slice(1, 3), [1, 2]), (torch.tensor([2, 0]), [2, 0])]
+    ("index", "kept"),
+    [(0, [0]), (2, [2]), (-1, [2]), (-2, [1]), (slice(1, 3), [1, 2]), (torch.tensor([2, 0]), [2, 0])],
 )
 def test_selection_keeps_the_batch_axis(index: int | slice | Tensor, kept: list[int]) -> None:
     material = random_svbrdf(3)
@@ -62,6 +63,11 @@ def test_random_legal_materials_pass_in_any_precision(dtype: torch.dtype) -> Non
     random_svbrdf(2, tilt=5.0).to(dtype).validate()
 
 
+def test_validation_is_silent_about_gradients() -> None:
+    material = random_svbrdf().map(lambda tensor: tensor.requires_grad_(True))
+    assert material.validate() is material  # a warning would fail the suite
+
+
 ILLEGAL = [
     ("normal", lambda n: n * 1.01, "normals must be unit vectors"),
     ("normal", lambda n: n * 0.0, "normals must be unit vectors"),
@@ -84,9 +90,13 @@ def test_illegal_values_are_named(name: str, spoil, message: str) -> None:  # ty
 
 
 @pytest.mark.usefixtures("unchecked")
-@pytest.mark.parametrize(("name", "shape"), [("roughness", (1, 3, 5, 7)), ("diffuse", (1, 3, 5, 8)), ("specular", (2, 3, 5, 7))])
+@pytest.mark.parametrize(
+    ("name", "shape"), [("roughness", (1, 3, 5, 7)), ("diffuse", (1, 3, 5, 8)), ("specular", (2, 3, 5, 7))]
+)
 def test_illegal_shapes_are_named(name: str, shape: tuple[int, ...]) -> None:
-    with pytest.raises(ValueError, match=rf"{name} has shape \({shape[0]}, {shape[1]}, 5, {shape[3]}\), expected"):
+    with pytest.raises(
+        ValueError, match=rf"{name} has shape \({shape[0]}, {shape[1]}, 5, {shape[3]}\), expected"
+    ):
         replace(random_svbrdf(), **{name: torch.full(shape, 0.5)}).validate()
 
 

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy import ndimage
 
-from nets.data.procedural.noise import Field
+from nets.data.procedural.noise import Field, Real
 
 Colour = NDArray[np.float32]  # [3] or [H, W, 3], linear RGB
 
@@ -49,45 +49,45 @@ class MaterialMaps:
         return normal_from_height(self.height)
 
 
-def slopes(height: Field) -> tuple[Field, Field]:
+def slopes(height: Real) -> tuple[Field, Field]:
     """Derivatives of `height` along x (right) and y (up), central differences; a pixel is 2 / W wide."""
     spacing = 2 / height.shape[1]
-    down, right = np.gradient(height, spacing)
+    down, right = (np.asarray(d, dtype=np.float32) for d in np.gradient(height, spacing))
     return right, -down
 
 
-def normal_from_height(height: Field) -> NDArray[np.float32]:
+def normal_from_height(height: Real) -> NDArray[np.float32]:
     """Unit normals `[H, W, 3]` of a height field in surface units."""
     along_x, along_y = slopes(height)
     normal = np.stack([-along_x, -along_y, np.ones_like(height)], axis=-1)
     return np.asarray(normal / np.linalg.norm(normal, axis=-1, keepdims=True), dtype=np.float32)
 
 
-def tilted(field: Field, degrees: float) -> Field:
+def tilted(field: Real, degrees: float) -> Field:
     """The field as a relief whose root-mean-square slope is `degrees`: looks alike at every resolution."""
     along_x, along_y = slopes(field)
     rms = float(np.sqrt(np.mean(along_x**2 + along_y**2)))
     return np.asarray(field * (np.tan(np.radians(degrees)) / max(rms, 1e-9)), dtype=np.float32)
 
 
-def cavity(height: Field, radius: float) -> Field:
+def cavity(height: Real, radius: float) -> Field:
     """Signed depth below the surroundings within `radius` surface units, in deviations: > 0 in pits."""
     below = ndimage.gaussian_filter(height, max(radius * height.shape[0] / 2, 0.8)) - height
     return np.asarray(below / max(float(below.std()), 1e-9), dtype=np.float32)
 
 
-def lerp(a: ArrayLike, b: ArrayLike, mask: Field) -> Field:
+def lerp(a: ArrayLike, b: ArrayLike, mask: Real) -> Field:
     """`a` where the mask is 0, `b` where it is 1; numbers or fields."""
     start = np.asarray(a, dtype=np.float32)
     return np.asarray(start + (np.asarray(b, dtype=np.float32) - start) * mask, dtype=np.float32)
 
 
-def blend(a: Colour, b: Colour, mask: Field) -> Colour:
+def blend(a: Real, b: Real, mask: Real) -> Colour:
     """Colour `a` where the mask is 0, `b` where it is 1; `[3]` or `[H, W, 3]`."""
     return np.asarray(a + (b - a) * mask[..., None], dtype=np.float32)
 
 
-def shade(colour: Colour, factor: Field) -> Colour:
+def shade(colour: Real, factor: Real) -> Colour:
     """A colour darkened or lightened by a field of factors around 1."""
     return np.asarray(colour * np.maximum(factor, 0)[..., None], dtype=np.float32)
 
@@ -99,25 +99,31 @@ def srgb(code: str) -> Colour:
     return linear.astype(np.float32)
 
 
+def rgb(red: float, green: float, blue: float) -> Colour:
+    """A linear colour `[3]` from its three numbers."""
+    return np.array([red, green, blue], dtype=np.float32)
+
+
 def choose(rng: np.random.Generator, codes: Sequence[str], spread: float = 0.12) -> Colour:
     """A colour between two of the given ones, then varied in lightness and a little in hue, `[3]`."""
     first, second = rng.integers(0, len(codes), 2)
     colour = srgb(codes[first]) + (srgb(codes[second]) - srgb(codes[first])) * rng.uniform(0, 0.5)
-    factor = np.exp(rng.normal(0, 2 * spread) + rng.normal(0, spread / 2, 3))
+    factor = np.exp(rng.normal(0, 2 * spread) + rng.normal(0, spread / 4, 3))
     return np.clip(colour * factor, 0.004, 0.9).astype(np.float32)
 
 
 def dye(rng: np.random.Generator, saturation: tuple[float, float] = (0, 0.9), value: float = 0.95) -> Colour:
-    """Any colour that man puts on things, `[3]`: hue free, dark to light, grey to saturated."""
-    hue, strength = rng.random(), rng.uniform(*saturation)
+    """Any colour that man puts on things, `[3]`: hue free, dark to light, grey to saturated, mostly muted."""
+    hue = rng.random()
+    strength = saturation[0] + (saturation[1] - saturation[0]) * rng.beta(1.2, 2)
     level = rng.uniform(0.15, value)
     encoded = np.array(colorsys.hsv_to_rgb(hue, strength, level))
     return np.clip(encoded**2.2, 0.004, 0.9).astype(np.float32)
 
 
-def shades(rng: np.random.Generator, colour: Colour, tone: Field, spread: float = 0.3) -> Colour:
+def shades(rng: np.random.Generator, colour: Real, tone: Real, spread: float = 0.3) -> Colour:
     """A colour per pixel: `tone` in [0, 1] runs from a darker, to a lighter and differently hued sibling."""
-    drift = rng.normal(0, 0.25 * spread, 3)
+    drift = rng.normal(0, 0.12 * spread, 3)
     dark = colour * np.exp(-spread + drift)
     light = np.clip(colour * np.exp(spread - drift), 0, 0.95)
     return blend(dark.astype(np.float32), light.astype(np.float32), tone)
@@ -132,8 +138,8 @@ def metal(rng: np.random.Generator, names: Sequence[str] | None = None) -> Colou
 
 def finish(
     rng: np.random.Generator,
-    height: Field,
-    diffuse: Colour,
+    height: Real,
+    diffuse: Real,
     roughness: ArrayLike,
     specular: ArrayLike = DIELECTRIC_F0,
     grain: float = 1.0,

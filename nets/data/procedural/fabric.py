@@ -6,10 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nets.data.procedural.compose import (
-    Colour,
     MaterialMaps,
     blend,
-    cavity,
     choose,
     dye,
     finish,
@@ -22,6 +20,7 @@ from nets.data.procedural.layout import Weave, weave
 from nets.data.procedural.noise import (
     Field,
     Index,
+    Real,
     bent,
     cells,
     grid,
@@ -37,7 +36,7 @@ from nets.data.procedural.noise import (
 )
 
 
-def _twist(rng: np.random.Generator, along: Field, across: Field, plies: float) -> Field:
+def _twist(rng: np.random.Generator, along: Real, across: Real, plies: float) -> Field:
     """Plies winding around a yarn, in [-1, 1]: slanted stripes that crowd towards its sides."""
     phase = plies * along + rng.uniform(0.3, 0.8) * np.arcsin(np.clip(across, -1, 1))
     return np.cos(2 * np.pi * phase).astype(np.float32)
@@ -56,7 +55,7 @@ def _stripes(rng: np.random.Generator, thread: Index) -> Field:
     return bands[thread % len(bands)]
 
 
-def _cloth(rng: np.random.Generator, size: int, cloth: Weave, warp: Colour, weft: Colour) -> MaterialMaps:
+def _cloth(rng: np.random.Generator, size: int, cloth: Weave, warp: Real, weft: Real) -> MaterialMaps:
     """Maps of a weave with the given colours of its two sets of threads (`[H, W, 3]`)."""
     twist = _twist(rng, cloth.along, cloth.across, rng.uniform(0.8, 2))
     fuzz = strokes(rng, size, 900, 0.07, curl=1.5)
@@ -159,7 +158,7 @@ def carpet(rng: np.random.Generator, size: int) -> MaterialMaps:
 
 
 def leather(rng: np.random.Generator, size: int) -> MaterialMaps:
-    """Pebbled grain with pores and creases; polished on the pebbles, dull and dark between; suede now and then."""
+    """Pebbled grain with pores and creases; polished on the pebbles, dull and dark between."""
     x, y = bent(rng, *grid(size), 0.015, low=8, slope=1.8)
     count = log_uniform(rng, 18, 55)
     grain = cells(rng, x, y, count, aspect=rng.uniform(0.75, 1.3))
@@ -183,5 +182,5 @@ def leather(rng: np.random.Generator, size: int) -> MaterialMaps:
     rub = patches(spectral(rng, size, 2, slope=1.3) + 0.6 * pebble, rng.uniform(0, 0.15), 0.3) * pebble
     diffuse = blend(diffuse, np.clip(diffuse * 1.8 + 0.02, 0, 0.8), 0.6 * rub)
     gloss = rng.uniform(0.25, 0.65)
-    roughness = gloss + 0.22 * valley + 0.1 * patina + 0.1 * rub - 0.04 * cavity(height, 0.02) * 0.2
+    roughness = gloss + 0.22 * valley + 0.1 * patina + 0.1 * rub
     return finish(rng, height, diffuse, roughness, 0.042 - 0.015 * valley, grain=0.7)

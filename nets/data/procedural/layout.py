@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from nets.data.procedural.noise import Field, Index, smoothstep
+from nets.data.procedural.noise import Field, Index, Real, smoothstep
 
 
 @dataclass(frozen=True)
@@ -42,18 +42,18 @@ def _blocks(
     return Blocks(along.astype(f32), across.astype(f32), edge.astype(f32), index.reshape(edge.shape), turned)
 
 
-def courses(x: Field, y: Field, length: float, width: float, shift: NDArray[np.floating]) -> Blocks:
-    """Rows of pieces; row `i` is displaced by `shift[i % n]` of a length (0: stack bond, 0 and 1/2: running)."""
+def courses(x: Real, y: Real, length: float, width: float, shift: NDArray[np.floating]) -> Blocks:
+    """Rows of pieces; row `i` is displaced by `shift[i % n]` of a length (0: stack; 0, 1/2: running)."""
     row = np.floor(y / width)
     position = x / length + shift[row.astype(np.intp) % len(shift)]
     column = np.floor(position)
     return _blocks((position - column - 0.5) * length, y - (row + 0.5) * width, length, width, column, row)
 
 
-def herringbone(x: Field, y: Field, width: float, ratio: int = 2) -> Blocks:
+def herringbone(x: Real, y: Real, width: float, ratio: int = 2) -> Blocks:
     """Pieces `ratio` times as long as wide, alternately lying and standing along the diagonals.
 
-    On a grid of squares, square (i, j) belongs to a lying piece if (i - j) mod 2n < n, else to a standing one.
+    On a grid of squares, square (i, j) is of a lying piece if (i - j) mod 2n < n, else of a standing one.
     """
     i, j = np.floor(x / width), np.floor(y / width)
     phase = np.mod(i - j, 2 * ratio)
@@ -67,7 +67,7 @@ def herringbone(x: Field, y: Field, width: float, ratio: int = 2) -> Blocks:
     return _blocks(along, across, length, width, left, bottom, turned)
 
 
-def basket(x: Field, y: Field, width: float, ratio: int = 4) -> Blocks:
+def basket(x: Real, y: Real, width: float, ratio: int = 4) -> Blocks:
     """Squares of `ratio` parallel strips, each square turned against its neighbours."""
     length = ratio * width
     i, j = np.floor(x / length), np.floor(y / length)
@@ -90,7 +90,7 @@ class Weave:
     across: Field  # across it, -1..1
 
 
-def weave(x: Field, y: Field, threads: float, pattern: NDArray[np.bool_], tightness: float = 0.95) -> Weave:
+def weave(x: Real, y: Real, threads: float, pattern: NDArray[np.bool_], tightness: float = 0.95) -> Weave:
     """Threads (`threads` over the width) woven by `pattern[row, column]`: True where the warp is on top.
 
     A thread's middle line rises and falls between its crossings; what is higher at a pixel is visible.
@@ -102,10 +102,10 @@ def weave(x: Field, y: Field, threads: float, pattern: NDArray[np.bool_], tightn
     def crossing(i: Index, j: Index) -> Field:
         return sign[j % sign.shape[0], i % sign.shape[1]]
 
-    def profile(t: Field) -> Field:  # a round thread, and nothing in the gap beside it
+    def profile(t: Real) -> Real:  # a round thread, and nothing in the gap beside it
         return np.sqrt(np.maximum(1 - (t / tightness) ** 2, 0)) - 2 * (np.abs(t) > tightness)
 
-    def between(t: Field) -> tuple[Index, Field]:
+    def between(t: Real) -> tuple[Index, Field]:
         start = np.floor(t - 0.5)
         return start.astype(np.intp), smoothstep(0, 1, t - 0.5 - start)
 

@@ -13,6 +13,7 @@ from nets.data.procedural.compose import (
     dye,
     finish,
     lerp,
+    rgb,
     shade,
     shades,
     tilted,
@@ -50,7 +51,7 @@ def paper(rng: np.random.Generator, size: int) -> MaterialMaps:
     )
     stain = patches(spectral(rng, size, 2, slope=1.5), rng.uniform(0, 0.3), 0.2)
     diffuse = shade(shades(rng, base, unit(spectral(rng, size, 3)), 0.08), 0.92 + 0.12 * fibre)
-    diffuse = blend(diffuse, diffuse * np.float32([0.8, 0.65, 0.45]), 0.5 * stain)
+    diffuse = blend(diffuse, diffuse * rgb(0.8, 0.65, 0.45), 0.5 * stain)
     flecks = np.clip(2 * strokes(rng, size, int(rng.integers(0, 200)), 0.05, curl=1), 0, 1)
     diffuse = blend(diffuse, choose(rng, ("#5a4a3a", "#7a6a5a", "#3a4a6a")), 0.7 * flecks)
     coated = rng.uniform(0.25, 0.5) if rng.random() < 0.25 else rng.uniform(0.7, 0.92)
@@ -68,7 +69,7 @@ def cardboard(rng: np.random.Generator, size: int) -> MaterialMaps:
         x, y = y, x
     flute = np.sin(x * log_uniform(rng, 25, 80) + 0.3 * spectral(rng, size, 2))
     fibre = strokes(rng, size, 4000, 0.15, spread=0.6, curl=1.2)
-    dents = np.minimum(spectral(rng, size, 3, slope=2) + 1.2, 0)
+    dents = np.minimum(spectral(rng, size, 3, 12, slope=3) + 1.2, 0)
     fine = spectral(rng, size, 25, slope=0.9, stretch=4)
     height = tilted(flute, rng.uniform(1, 6)) + tilted(fibre + 0.4 * fine, rng.uniform(2, 5)) + 0.01 * dents
     kraft = shades(
@@ -87,7 +88,7 @@ def cardboard(rng: np.random.Generator, size: int) -> MaterialMaps:
         diffuse = blend(diffuse, dye(rng, (0, 0.9), 0.6), np.clip(ink, 0, 1))
     shiny = float(rng.random() < 0.2)
     roughness = 0.82 - 0.4 * shiny + 0.05 * fine - 0.03 * flute + 0.05 * fibre
-    return finish(rng, height, diffuse, roughness, 0.036 - 0.01 * (dents < 0))
+    return finish(rng, height, diffuse, roughness, 0.036)
 
 
 def _print(rng: np.random.Generator, size: int) -> Field:
@@ -121,7 +122,7 @@ def plastic_grain(rng: np.random.Generator, size: int) -> MaterialMaps:
     worn = patches(spectral(rng, size, 2, slope=1.6), rng.uniform(0, 0.4), 0.7)
     dust = rng.uniform(0, 0.3) * smoothstep(0, 2, cavity(height, 0.03)) * unit(spectral(rng, size, 2))
     diffuse = shade(dye(rng), 0.95 + 0.1 * texture + 0.3 * scuff * rng.uniform(-0.3, 1))
-    diffuse = blend(diffuse, np.float32([0.35, 0.33, 0.3]), dust)
+    diffuse = blend(diffuse, rgb(0.35, 0.33, 0.3), dust)
     roughness = rng.uniform(0.25, 0.6) + 0.08 * (1 - texture) - 0.12 * worn + 0.12 * scuff + dust
     return finish(rng, height - 0.001 * scuff, diffuse, roughness, 0.045 - 0.015 * dust, grain=0.5)
 

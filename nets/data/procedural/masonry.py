@@ -23,6 +23,7 @@ from nets.data.procedural.noise import (
     bent,
     cells,
     grid,
+    lean,
     log_uniform,
     patches,
     pick,
@@ -36,13 +37,8 @@ from nets.data.procedural.noise import (
 
 _CLAY = ("#9c4a34", "#7d3b2c", "#b5654a", "#c98f6b", "#5f3a33", "#d0b090", "#a8553a", "#8f8578")
 _STONE = ("#8b857b", "#6f6c68", "#a59a86", "#5d5a57", "#b8ab94", "#7d7263", "#9a8f8a", "#6a6f74")
+_LIME: Colour = np.array([0.6, 0.57, 0.52], dtype=np.float32)  # efflorescence
 _MORTAR = ("#a9a49a", "#8c8780", "#c2bbae", "#6a6661", "#b8a890")
-
-
-def _lean(rng: np.random.Generator, blocks: Blocks, slope: float) -> Field:
-    """Every piece sits a little askew: a plane per piece, of up to `slope`."""
-    u, v = pick(rng, blocks.index, -slope, slope), pick(rng, blocks.index, -slope, slope)
-    return u * blocks.along + v * blocks.across
 
 
 def _mortar(rng: np.random.Generator, size: int) -> tuple[Colour, Field]:
@@ -76,7 +72,10 @@ def brick(rng: np.random.Generator, size: int) -> MaterialMaps:
     soot = unit(spectral(rng, size, 2, slope=1.5))
     diffuse = shade(blend(shade(filler, 1 + 0.1 * chips), clay, face), 0.8 + 0.35 * soot)
     fired = rng.uniform(0.45, 0.85)
-    height = face * (width * rng.uniform(0.06, 0.14) + _lean(rng, blocks, 0.05)) + (1 - face) * sand
+    height = (
+        face * (width * rng.uniform(0.06, 0.14) + lean(rng, blocks.index, blocks.along, blocks.across, 0.05))
+        + (1 - face) * sand
+    )
     height = height + face * tilted(body - 2 * pits, rng.uniform(4, 10))
     roughness = lerp(0.93, fired + 0.05 * body + 0.12 * pits, face)
     return finish(rng, height, diffuse, roughness, lerp(0.03, 0.042, face), grain=1.2)
@@ -84,20 +83,21 @@ def brick(rng: np.random.Generator, size: int) -> MaterialMaps:
 
 def cobblestone(rng: np.random.Generator, size: int) -> MaterialMaps:
     """Rounded setts or river cobbles in sandy joints, polished on their crowns; sometimes wet."""
-    x, y = bent(rng, *grid(size), 0.02, low=5)
+    x, y = bent(rng, *grid(size), 0.015, low=5, slope=3)
     count = log_uniform(rng, 4.5, 11)
     stones = cells(rng, x, y, count, jitter=rng.uniform(0.45, 0.9))
     reach = 1.0 / count
-    edge = stones.edge - reach * rng.uniform(0.06, 0.16) - 0.1 * reach * spectral(rng, size, 10, slope=1.5)
-    crown = np.sqrt(np.clip(edge / (reach * rng.uniform(0.5, 0.9)), 0, 1))
+    edge = stones.edge - reach * (rng.uniform(0.08, 0.18) + 0.04 * spectral(rng, size, 8, slope=2))
+    bulge = np.clip(edge / (reach * rng.uniform(0.4, 0.8)), 0, 1)
+    crown = np.sqrt(bulge * (2 - bulge))  # round at the rim, level on top
     face = smoothstep(0, 0.25, crown)
     body = scattered(rng, spectral(rng, size, 6, slope=1.2), stones.index)
     filler, sand = _mortar(rng, size)
     filler = filler * np.float32(rng.uniform(0.25, 0.8))
     stone = shades(rng, choose(rng, _STONE), pick(rng, stones.index), 0.35)
     diffuse = blend(shade(filler, 1 + 0.2 * unit(sand)), shade(stone, 1 + 0.15 * body), face)
-    height = reach * rng.uniform(0.3, 0.6) * crown * pick(rng, stones.index, 0.75, 1.0)
-    height = height + tilted(body, rng.uniform(3, 8)) * face + 0.7 * sand * (1 - face)
+    height = reach * rng.uniform(0.15, 0.35) * crown * pick(rng, stones.index, 0.75, 1.0)
+    height = height + tilted(body, rng.uniform(2, 5)) * face + 0.7 * sand * (1 - face)
     wet = float(rng.random() < 0.35) * smoothstep(-1.0, 1.5, cavity(height, 0.1) + spectral(rng, size, 2))
     diffuse = shade(diffuse, 1 - 0.45 * wet)
     polish = rng.uniform(0.1, 0.4) * smoothstep(0.6, 1, crown)
@@ -112,16 +112,16 @@ def stone_wall(rng: np.random.Generator, size: int) -> MaterialMaps:
         rng, x, y, rng.uniform(2.5, 6), aspect=rng.uniform(1.0, 2.0), jitter=rng.uniform(0.5, 0.85)
     )
     hewn = spectral(rng, size, 5, slope=1.7)
-    edge = stones.edge - rng.uniform(0.012, 0.03) - 0.008 * hewn
+    edge = stones.edge - rng.uniform(0.012, 0.03) - 0.006 * hewn
     face = smoothstep(0, rng.uniform(0.02, 0.06), edge)
     body = scattered(rng, spectral(rng, size, 3, slope=1.5), stones.index)
-    chisel = tilted(body + 0.4 * scattered(rng, np.abs(hewn), stones.index), rng.uniform(8, 15))
-    tilt = pick(rng, stones.index, -0.15, 0.15) * stones.dx + pick(rng, stones.index, -0.15, 0.15) * stones.dy
+    chisel = tilted(body + 0.4 * scattered(rng, np.abs(hewn), stones.index), rng.uniform(6, 12))
+    tilt = lean(rng, stones.index, stones.dx, stones.dy, 0.15)
     filler, sand = _mortar(rng, size)
     colour = shades(rng, choose(rng, _STONE), pick(rng, stones.index), rng.uniform(0.2, 0.5))
     stain = unit(spectral(rng, size, 2, slope=1.3))
     colour = blend(shade(colour, 1 + 0.14 * body), choose(rng, _STONE), 0.4 * stain)
-    height = face * (0.05 + tilt + chisel) + (1 - face) * sand
+    height = face * (0.035 + tilt + chisel) + (1 - face) * sand
     roughness = lerp(0.92, 0.74 + 0.06 * body - 0.1 * stain, face)
     return finish(rng, height, blend(filler, colour, face), roughness, lerp(0.03, 0.04, face), grain=1.3)
 
@@ -179,7 +179,9 @@ def glazed_tile(rng: np.random.Generator, size: int) -> MaterialMaps:
     crack = (1 - smoothstep(0.0, 0.006, craze.edge)) * float(rng.random() < 0.3)
     colour = shade(colour, (1 + 0.12 * pool + 0.15 * rim) * (1 - 0.4 * crack))
     filler, sand = _mortar(rng, size)
-    height = face * (0.012 + 0.2 * gap * pool + _lean(rng, blocks, 0.03) - 0.006 * rim)
+    height = face * (
+        0.012 + 0.2 * gap * pool + lean(rng, blocks.index, blocks.along, blocks.across, 0.03) - 0.006 * rim
+    )
     height = height + face * tilted(pool, rng.uniform(1, 4)) + (1 - face) * sand
     gloss = rng.uniform(0.08, 0.3) if rng.random() < 0.75 else rng.uniform(0.35, 0.6)
     dirt = unit(spectral(rng, size, 3, slope=1.2)) ** 3
@@ -204,7 +206,11 @@ def mosaic_tile(rng: np.random.Generator, size: int) -> MaterialMaps:
     glass = rng.random() < 0.6
     base = rng.uniform(0.08, 0.25) if glass else rng.uniform(0.4, 0.7)
     filler, sand = _mortar(rng, size)
-    height = face * (0.015 + _lean(rng, blocks, 0.1)) + face * tilted(body, 3) + (1 - face) * sand
+    height = (
+        face * (0.008 + lean(rng, blocks.index, blocks.along, blocks.across, 0.1))
+        + face * tilted(body, 3)
+        + (1 - face) * sand
+    )
     roughness = lerp(0.9, base + pick(rng, blocks.index, 0, 0.15) + 0.03 * body, face)
     diffuse = blend(filler, shade(colour, 1 + 0.12 * body), face)
     return finish(rng, height, diffuse, roughness, lerp(0.03, 0.05 if glass else 0.04, face), grain=0.5)
@@ -224,17 +230,14 @@ def terracotta(rng: np.random.Generator, size: int) -> MaterialMaps:
     bloom = patches(spectral(rng, size, 3, slope=1.0), rng.uniform(0, 0.3), 0.6) * face
     pores = patches(spectral(rng, size, 40, slope=2), 0.05, 0.3) * face
     lines = strokes(rng, size, 60, 0.5, spread=0.15, curl=0.1) * face
-    diffuse = blend(blend(filler, shade(clay, 1 - 0.3 * pores), face), srgb_lime(), 0.35 * bloom)
+    diffuse = blend(blend(filler, shade(clay, 1 - 0.3 * pores), face), _LIME, 0.35 * bloom)
     worn = smoothstep(0.1 * width, 0.45 * width, blocks.edge)
-    height = face * (0.03 + _lean(rng, blocks, 0.04) + tilted(body - pores, rng.uniform(3, 7))) + sand * (
-        1 - face
-    )
+    height = face * (
+        0.03
+        + lean(rng, blocks.index, blocks.along, blocks.across, 0.04)
+        + tilted(body - pores, rng.uniform(3, 7))
+    ) + sand * (1 - face)
     height = height - 0.002 * lines
     base = rng.uniform(0.3, 0.5) if rng.random() < 0.4 else rng.uniform(0.65, 0.85)
     roughness = lerp(0.92, base - 0.1 * worn + 0.15 * bloom + 0.1 * lines, face)
     return finish(rng, height, diffuse, roughness, lerp(0.03, 0.04, face))
-
-
-def srgb_lime() -> Colour:
-    """The white of lime efflorescence, linear `[3]`."""
-    return np.float32([0.6, 0.57, 0.52])

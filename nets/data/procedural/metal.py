@@ -1,11 +1,10 @@
-"""Metals, bare and coated: brushed, scratched, hammered, tread plate, galvanized, rust on paint, flake paint."""
+"""Metals, bare and coated: brushed, scratched, hammered, tread plate, zinc, rust on paint, flake paint."""
 
 from __future__ import annotations
 
 import numpy as np
 
 from nets.data.procedural.compose import (
-    Colour,
     MaterialMaps,
     blend,
     cavity,
@@ -14,15 +13,18 @@ from nets.data.procedural.compose import (
     finish,
     lerp,
     metal,
+    rgb,
     shade,
     shades,
     tilted,
 )
 from nets.data.procedural.noise import (
     Field,
+    Real,
     bent,
     cells,
     grid,
+    lean,
     log_uniform,
     patches,
     pick,
@@ -44,14 +46,12 @@ def _tarnish(rng: np.random.Generator, size: int, strength: float) -> Field:
 
 
 def _bare(
-    rng: np.random.Generator, height: Field, f0: Colour, roughness: Field, tarnish: Field, grime: Field
+    rng: np.random.Generator, height: Real, f0: Real, roughness: Real, tarnish: Real, grime: Real
 ) -> MaterialMaps:
     """A bare metal: hardly any diffuse, but for grime where it settles; tarnish dulls and darkens."""
     dirt = choose(rng, ("#3a332c", "#4a4038", "#2a2826"))
-    diffuse = blend(
-        np.float32([0.008, 0.008, 0.008]) + 0.02 * f0, dirt, np.clip(grime + 0.15 * tarnish, 0, 1)
-    )
-    specular = blend(shade(np.asarray(f0), 1 - 0.5 * tarnish), np.float32([0.04, 0.04, 0.04]), 0.85 * grime)
+    diffuse = blend(rgb(0.008, 0.008, 0.008) + 0.02 * f0, dirt, np.clip(grime + 0.15 * tarnish, 0, 1))
+    specular = blend(shade(np.asarray(f0), 1 - 0.5 * tarnish), rgb(0.04, 0.04, 0.04), 0.85 * grime)
     return finish(rng, height, diffuse, lerp(roughness + 0.3 * tarnish, 0.85, grime), specular, grain=0.5)
 
 
@@ -108,14 +108,14 @@ def hammered_metal(rng: np.random.Generator, size: int) -> MaterialMaps:
 
 
 def diamond_plate(rng: np.random.Generator, size: int) -> MaterialMaps:
-    """Tread plate: raised lens-shaped bars at alternating right angles, their crowns rubbed bright; or painted."""
+    """Tread plate: raised lens-shaped bars at alternating right angles, rubbed bright on top; or painted."""
     x, y = rotated(*grid(size), rng.choice([0.0, np.pi / 4]))
     pitch = log_uniform(rng, 0.16, 0.4)
     i, j = np.floor(x / pitch), np.floor(y / pitch)
     u, v = x / pitch - i - 0.5, y / pitch - j - 0.5
     sign = np.where(np.mod(i + j, 2) > 0, 1, -1) * np.float32(np.sqrt(0.5))
     along, across = u * np.sqrt(0.5) + v * sign, v * np.sqrt(0.5) - u * sign
-    lens = 1 - (along / rng.uniform(0.5, 0.62)) ** 2 - np.abs(across) / rng.uniform(0.13, 0.2)
+    lens = 1 - (along / rng.uniform(0.4, 0.52)) ** 2 - np.abs(across) / rng.uniform(0.13, 0.2)
     bar = smoothstep(0, 0.6, lens.astype(np.float32))
     rolled = spectral(rng, size, 12, slope=1.2)
     scratch = strokes(rng, size, int(rng.integers(100, 1200)), 0.3, curl=0.2)
@@ -125,8 +125,8 @@ def diamond_plate(rng: np.random.Generator, size: int) -> MaterialMaps:
     roughness = rng.uniform(0.25, 0.5) - 0.12 * bar + 0.1 * scratch + 0.04 * rolled
     if rng.random() < 0.3:
         paint = 1 - patches(bar + 0.5 * rolled, rng.uniform(0.05, 0.3), 0.1)
-        diffuse = blend(np.float32([0.02, 0.02, 0.02]), dye(rng), paint)
-        specular = blend(f0, np.float32([0.04, 0.04, 0.04]), paint)
+        diffuse = blend(rgb(0.02, 0.02, 0.02), dye(rng), paint)
+        specular = blend(f0, rgb(0.04, 0.04, 0.04), paint)
         return finish(rng, height, diffuse, roughness + 0.1 * paint, specular, grain=0.7)
     grime = rng.uniform(0, 0.9) * (1 - bar) * patches(rolled + spectral(rng, size, 2), 0.4, 0.5)
     return _bare(rng, height, f0, roughness, tarnish, grime)
@@ -134,25 +134,22 @@ def diamond_plate(rng: np.random.Generator, size: int) -> MaterialMaps:
 
 def galvanized(rng: np.random.Generator, size: int) -> MaterialMaps:
     """Zinc spangle: crystals with feathered grain, each of its own brightness; white rust in places."""
-    x, y = bent(rng, *grid(size), 0.02, low=8, slope=1.6)
+    x, y = bent(rng, *grid(size), 0.008, low=10, slope=1.8)
     crystal = cells(rng, x, y, log_uniform(rng, 6, 20))
     turn = pick(rng, crystal.index, 0, np.pi)
     feather = np.sin(
         (crystal.dx * np.cos(turn) + crystal.dy * np.sin(turn)) * 150 + 2 * spectral(rng, size, 20)
     )
     tone = pick(rng, crystal.index)
-    tilt = (
-        pick(rng, crystal.index, -0.03, 0.03) * crystal.dx
-        + pick(rng, crystal.index, -0.03, 0.03) * crystal.dy
-    )
+    tilt = lean(rng, crystal.index, crystal.dx, crystal.dy, 0.006)
     height = (
         tilt + tilted(feather, rng.uniform(1, 3)) + tilted(spectral(rng, size, 3, slope=2), rng.uniform(1, 3))
     )
-    roughness = rng.uniform(0.25, 0.45) + 0.18 * tone + 0.03 * feather
-    shine = shade(metal(rng, ("zinc",)), 0.7 + 0.35 * tone + 0.04 * feather)
-    bloom = patches(spectral(rng, size, 3, slope=1.1), rng.uniform(0, 0.3), 0.5) * rng.uniform(0.2, 0.8)
-    diffuse = blend(np.float32([0.015, 0.015, 0.016]), choose(rng, ("#a9aeb0", "#b8b9b5")), bloom)
-    specular = blend(shine, np.float32([0.05, 0.05, 0.05]), 0.8 * bloom)
+    roughness = rng.uniform(0.22, 0.42) + 0.25 * tone + 0.03 * feather
+    shine = shade(metal(rng, ("zinc",)), 0.55 + 0.5 * tone + 0.05 * feather)
+    bloom = patches(spectral(rng, size, 3, slope=1.1), rng.uniform(0, 0.2), 0.8) * rng.uniform(0.1, 0.7)
+    diffuse = blend(rgb(0.015, 0.015, 0.016), choose(rng, ("#a9aeb0", "#b8b9b5")), bloom)
+    specular = blend(shine, rgb(0.05, 0.05, 0.05), 0.8 * bloom)
     return finish(rng, height, diffuse, lerp(roughness, 0.8, bloom), specular, grain=0.6)
 
 
@@ -174,13 +171,11 @@ def rusted_paint(rng: np.random.Generator, size: int) -> MaterialMaps:
     colour = shades(rng, choose(rng, _RUST), unit(scale_relief + 0.8 * spectral(rng, size, 5)), 0.5)
     paint = blend(dye(rng), choose(rng, _RUST), 0.45 * halo)
     steel = metal(rng, ("iron", "titanium"))
-    diffuse = blend(blend(colour, np.float32([0.03, 0.03, 0.03]), chipped), paint, coat)
+    diffuse = blend(blend(colour, rgb(0.03, 0.03, 0.03), chipped), paint, coat)
     gloss = rng.uniform(0.12, 0.55)
     roughness = lerp(lerp(0.88 + 0.05 * scale_relief, 0.4, chipped), gloss + 0.2 * halo, coat)
     bare = np.clip(chipped * 0.8 + 0.06 * rust * (scale_relief > 1), 0, 1)
-    return finish(
-        rng, height, diffuse, roughness, blend(np.float32([0.04, 0.04, 0.04]), steel, bare), grain=0.9
-    )
+    return finish(rng, height, diffuse, roughness, blend(rgb(0.04, 0.04, 0.04), steel, bare), grain=0.9)
 
 
 def flake_paint(rng: np.random.Generator, size: int) -> MaterialMaps:
@@ -189,7 +184,7 @@ def flake_paint(rng: np.random.Generator, size: int) -> MaterialMaps:
     flake = cells(rng, x, y, log_uniform(rng, 60, 130))
     bright = pick(rng, flake.index) ** 2
     colour = dye(rng, (0.2, 0.95))
-    tilt = 0.12 * (pick(rng, flake.index, -1, 1) * flake.dx + pick(rng, flake.index, -1, 1) * flake.dy)
+    tilt = lean(rng, flake.index, flake.dx, flake.dy, 0.12)
     swirls = strokes(rng, size, int(rng.integers(20, 500)), 0.35, curl=1.2, width=0.4)
     peel = tilted(spectral(rng, size, 14, 40, 1.5), rng.uniform(0.5, 3.5))
     height = peel + rng.uniform(0.2, 1) * tilt - 0.0008 * swirls

@@ -19,9 +19,11 @@ from nets.data.procedural.compose import (
 )
 from nets.data.procedural.noise import (
     Field,
+    Real,
     bent,
     cells,
     grid,
+    lean,
     log_uniform,
     patches,
     pick,
@@ -33,11 +35,22 @@ from nets.data.procedural.noise import (
 )
 
 _EARTH = ("#6b5139", "#8a7152", "#4f3d2c", "#a58d6c", "#7a6a58", "#93694a")
+_CHIPS = ("#e0dbd0", "#8a5a4c", "#4a4d4a", "#b99a72", "#6f7f72", "#2c2b2b", "#c9a596")
 _GREY = ("#9b9893", "#7f7d79", "#b5b1a8", "#8d8f90", "#6d6b68")
+
+# Body and vein colours that occur together: Carrara, Nero Marquina, Crema, Verde, Rosso, Emperador.
+_MARBLES = (
+    (("#e4e2de", "#cfd0d0"), ("#6d7176", "#8a8c90")),
+    (("#26262a", "#38383a"), ("#d8d4cc", "#b8b4ac")),
+    (("#dccbb0", "#cdb592"), ("#9a7048", "#b58a60")),
+    (("#44584c", "#2f4038"), ("#b9c4b4", "#8aa08e")),
+    (("#8f5548", "#a86f5e"), ("#e0d0c4", "#5a3830")),
+    (("#5f4838", "#765a46"), ("#c9ad88", "#3a2a20")),
+)
 
 
 def plaster(rng: np.random.Generator, size: int) -> MaterialMaps:
-    """Painted plaster or stucco: trowelled smooth, dashed rough, or combed, with hairline cracks and stains."""
+    """Painted plaster or stucco: trowelled, dashed or knocked down, with hairline cracks and stains."""
     trowel = spectral(rng, size, 4, slope=2.2, stretch=rng.uniform(1, 4), angle=rng.uniform(0, np.pi))
     style = rng.choice(["trowelled", "dashed", "knocked"])
     if style == "dashed":
@@ -86,7 +99,7 @@ def concrete(rng: np.random.Generator, size: int) -> MaterialMaps:
 def gravel(rng: np.random.Generator, size: int) -> MaterialMaps:
     """Loose pebbles in three layers over soil, angular or round, each of its own colour."""
     x, y = grid(size)
-    height = tilted(spectral(rng, size, 12, slope=1.2), 8)
+    height = tilted(spectral(rng, size, 12, slope=1.2), 8) * np.float32(0.5)
     diffuse = shade(choose(rng, _EARTH), 0.5 + 0.3 * unit(height / height.std()))
     roughness = np.full_like(x, 0.92)
     count, hue = log_uniform(rng, 9, 22), choose(rng, (*_GREY, "#a0917c", "#7a6f66", "#b39b84"))
@@ -96,13 +109,11 @@ def gravel(rng: np.random.Generator, size: int) -> MaterialMaps:
         stones = cells(rng, u, v, count * (1.3 - 0.15 * layer))
         reach = 1 / count
         inside = stones.edge - reach * rng.uniform(0.08, 0.2)
-        crown = np.clip(inside / (0.55 * reach), 0, 1) ** (0.4 + 0.3 * angular)
-        lean = (
-            pick(rng, stones.index, -0.25, 0.25) * stones.dx
-            + pick(rng, stones.index, -0.25, 0.25) * stones.dy
-        )
+        bulge = np.clip(inside / (rng.uniform(0.4, 0.6) * reach), 0, 1)
+        crown = bulge * (2 - bulge) ** (1 - angular)  # round to faceted
+        askew = lean(rng, stones.index, stones.dx, stones.dy, 0.25)
         chosen = pick(rng, stones.index) < (0.95, 0.55, 0.35)[layer]
-        top = 0.25 * reach * layer + 0.5 * reach * crown * pick(rng, stones.index, 0.7, 1.2) + lean
+        top = 0.12 * reach * layer + 0.3 * reach * crown * pick(rng, stones.index, 0.7, 1.2) + askew
         mask = (chosen & (inside > 0) & (top > height)).astype(np.float32)
         body = spectral(rng, size, 12, slope=1.2)
         stone = shade(shades(rng, hue, pick(rng, stones.index), 0.55), 1 + 0.12 * body)
@@ -115,35 +126,29 @@ def gravel(rng: np.random.Generator, size: int) -> MaterialMaps:
 
 def marble(rng: np.random.Generator, size: int) -> MaterialMaps:
     """Clouded stone with veins of several widths, polished with faint scratches, or honed."""
-    fold = spectral(rng, size, 1.5, slope=2.0, stretch=rng.uniform(1, 3), angle=rng.uniform(0, np.pi))
-    rough_fold = fold + 0.25 * spectral(rng, size, 4, slope=1.5)
-    broad, thin = (
-        veins(rough_fold, rng.uniform(0.15, 0.5)),
-        veins(spectral(rng, size, 2, slope=1.6) + 0.5 * fold, 0.03),
-    )
-    strength = unit(spectral(rng, size, 2, slope=1.5))
-    body = choose(rng, ("#dcd8d0", "#c9c2b6", "#3a3a3c", "#d6c4ac", "#4f5f55", "#9a6a5a", "#bfc2c4"))
-    vein = choose(rng, ("#7f7f82", "#a08058", "#d8d4cc", "#5a5048", "#cfc7b8"))
-    diffuse = shades(
-        rng, body, unit(0.7 * fold + 0.7 * spectral(rng, size, 6, slope=1.0)), rng.uniform(0.08, 0.3)
-    )
-    diffuse = blend(diffuse, vein, np.clip(broad**2 * strength * 0.7 + thin * strength, 0, 0.9))
+    angle, stretch = rng.uniform(0, np.pi), rng.uniform(1.5, 4)
+    fold = spectral(rng, size, 1.5, slope=1.7, stretch=stretch, angle=angle)
+    second = 0.5 * fold + spectral(rng, size, 3, slope=1.9, stretch=stretch, angle=angle + 0.6)
+    # Strong over some stretches, gone over others: veins heal.
+    strength = smoothstep(-0.3, 1.2, spectral(rng, size, 2, slope=1.8))
+    broad = veins(fold, rng.uniform(0.2, 0.7)) * strength
+    thin = veins(second, 0.08) * smoothstep(-0.5, 1, spectral(rng, size, 2, slope=1.8))
+    body, vein = (choose(rng, codes) for codes in _MARBLES[int(rng.integers(len(_MARBLES)))])
+    clouds = unit(0.7 * fold + 0.5 * spectral(rng, size, 8, slope=1.2))
+    diffuse = shades(rng, body, clouds, rng.uniform(0.1, 0.35))
+    diffuse = blend(diffuse, vein, np.clip(0.75 * broad**1.5 + 0.8 * thin, 0, 0.92))
     scratch = strokes(rng, size, int(rng.integers(20, 250)), 0.5, curl=0.3)
-    height = (
-        tilted(spectral(rng, size, 3, slope=2), rng.uniform(0.3, 2))
-        - 0.0006 * scratch
-        - 0.0015 * thin * strength
-    )
+    height = tilted(spectral(rng, size, 3, slope=2), rng.uniform(0.3, 2)) - 0.0006 * scratch - 0.0015 * thin
     gloss = rng.uniform(0.08, 0.25) if rng.random() < 0.7 else rng.uniform(0.4, 0.65)
     smear = unit(spectral(rng, size, 3, slope=1.2, stretch=2))
-    roughness = gloss + 0.08 * smear + 0.12 * scratch + 0.12 * thin * strength
+    roughness = gloss + 0.08 * smear + 0.12 * scratch + 0.12 * thin
     return finish(rng, height, diffuse, roughness, 0.045 + 0.01 * broad, grain=0.35)
 
 
 def granite(rng: np.random.Generator, size: int) -> MaterialMaps:
     """Crystals of feldspar, quartz and mica of several sizes; polished, or flamed and rough."""
-    x, y = bent(rng, *grid(size), 0.01, low=12, slope=1.6)
-    count = log_uniform(rng, 35, 90)
+    x, y = bent(rng, *grid(size), 0.008, low=12, slope=1.6)
+    count = log_uniform(rng, 45, 130)
     colours = np.stack(
         [choose(rng, c) for c in (("#b8a79a", "#a8746a", "#c9c3ba", "#8f9a94"), _GREY, ("#2a2928",))]
     )
@@ -170,7 +175,7 @@ def terrazzo(rng: np.random.Generator, size: int) -> MaterialMaps:
     x, y = grid(size)
     bed = choose(rng, (*_GREY, "#d8d2c6", "#3c3f42", "#b59a8a", "#7f9088"))
     diffuse: Colour = shade(bed, 1 + 0.06 * spectral(rng, size, 20, slope=0.6))
-    chips = [np.maximum(dye(rng, (0, 0.5)), 0.05) for _ in range(int(rng.integers(2, 5)))]
+    chips = [choose(rng, _CHIPS, 0.2) for _ in range(int(rng.integers(2, 5)))]
     inlay = np.zeros_like(x)
     for count in (60.0, 30.0, log_uniform(rng, 8, 18)):
         u, v = bent(rng, x, y, 0.3 / count, low=count / 2, slope=2)
@@ -210,15 +215,15 @@ def sand(rng: np.random.Generator, size: int) -> MaterialMaps:
 
 def cracked_mud(rng: np.random.Generator, size: int) -> MaterialMaps:
     """Dried plates with curled rims between cracks of two generations."""
-    x, y = bent(rng, *grid(size), 0.03, low=6, slope=1.8)
+    x, y = bent(rng, *grid(size), 0.015, low=6, slope=2)
     count = log_uniform(rng, 4, 11)
     major, minor = cells(rng, x, y, count), cells(rng, x, y, 2.2 * count)
     wide = rng.uniform(0.04, 0.12) / count
     plate = smoothstep(wide, 3 * wide, major.edge) * (0.6 + 0.4 * smoothstep(0, 0.6 * wide, minor.edge))
     curl = np.exp(-major.edge * count * 2.5) * rng.uniform(0, 0.12)
     body = spectral(rng, size, 8, slope=1.4)
-    tilt = pick(rng, major.index, -0.08, 0.08) * major.dx + pick(rng, major.index, -0.08, 0.08) * major.dy
-    height = plate * (0.3 / count + curl / count * 2 + tilt) + tilted(body, rng.uniform(4, 9))
+    tilt = lean(rng, major.index, major.dx, major.dy, 0.08)
+    height = plate * (0.12 / count + curl / count + tilt) + tilted(body, rng.uniform(4, 9))
     colour = shades(
         rng, choose(rng, (*_EARTH, "#a89878", "#8a5f48")), unit(0.6 * body + spectral(rng, size, 2)), 0.2
     )
@@ -254,6 +259,6 @@ def moss_ground(rng: np.random.Generator, size: int) -> MaterialMaps:
     return finish(rng, height, shade(diffuse, 1 - damp), roughness - damp, 0.035 + 0.01 * tufts, grain=1.5)
 
 
-def _hollow(height: Field) -> Field:
+def _hollow(height: Real) -> Field:
     """Where water stays, in [0, 1]."""
     return smoothstep(0, 2, cavity(height, 0.1))

@@ -13,7 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import fft, ndimage
 
-Field = NDArray[np.float32]  # [H, W]
+Field = NDArray[np.float32]  # [H, W], what is returned
+Real = NDArray[np.floating[Any]]  # what is accepted: any precision
 Index = NDArray[np.intp]  # [H, W], which cell or block a pixel belongs to
 
 
@@ -24,7 +25,7 @@ def grid(size: int) -> tuple[Field, Field]:
     return x, y
 
 
-def rotated(x: Field, y: Field, angle: float) -> tuple[Field, Field]:
+def rotated(x: Real, y: Real, angle: float) -> tuple[Field, Field]:
     """The coordinates in a frame turned counter-clockwise by `angle` radians."""
     c, s = np.float32(np.cos(angle)), np.float32(np.sin(angle))
     return c * x + s * y, c * y - s * x
@@ -62,32 +63,32 @@ def spectral(
     return np.asarray(field / max(float(field.std()), 1e-12), dtype=np.float32)
 
 
-def smoothstep(low: float, high: float, value: Field) -> Field:
+def smoothstep(low: float, high: float, value: Real) -> Field:
     """0 below `low`, 1 above `high`, a smooth cubic between."""
     t = np.clip((value - low) / (high - low), 0, 1)
     return np.asarray(t * t * (3 - 2 * t), dtype=np.float32)
 
 
-def unit(noise: Field) -> Field:
+def unit(noise: Real) -> Field:
     """Noise of unit deviation mapped to [0, 1]: two deviations fill the range, the rest saturates."""
     return np.clip(0.5 + 0.25 * noise, 0, 1)
 
 
-def patches(noise: Field, coverage: float, softness: float = 0.15) -> Field:
+def patches(noise: Real, coverage: float, softness: float = 0.15) -> Field:
     """A mask in [0, 1] that is 1 where `noise` is highest, over about `coverage` of the surface."""
     threshold = float(np.quantile(noise[::2, ::2], 1 - np.clip(coverage, 0, 1)))
     return smoothstep(threshold - softness, threshold + softness, noise)
 
 
-def veins(noise: Field, width: float) -> Field:
+def veins(noise: Real, width: float) -> Field:
     """1 along the zero contours of `noise`, falling to 0 within `width` deviations: cracks and veins."""
     return 1 - smoothstep(0, width, np.abs(noise))
 
 
 def bent(
-    rng: np.random.Generator, x: Field, y: Field, amount: float, low: float = 3, slope: float = 2.5
+    rng: np.random.Generator, x: Real, y: Real, amount: float, low: float = 3, slope: float = 2.5
 ) -> tuple[Field, Field]:
-    """Coordinates displaced by smooth noise of deviation `amount` surface units: nothing is quite straight."""
+    """Coordinates displaced by smooth noise of deviation `amount`: nothing is quite straight."""
     size = x.shape[0]
     return (
         x + np.float32(amount) * spectral(rng, size, low, slope=slope),
@@ -101,12 +102,18 @@ def pick(rng: np.random.Generator, index: Index, low: float = 0, high: float = 1
     return values[index]
 
 
+def lean(rng: np.random.Generator, index: Index, u: Real, v: Real, slope: float) -> Field:
+    """Every piece sits a little askew: a plane per piece in its own coordinates, of up to `slope`."""
+    plane = u * pick(rng, index, -slope, slope) + v * pick(rng, index, -slope, slope)
+    return np.asarray(plane, dtype=np.float32)
+
+
 def scattered(
-    rng: np.random.Generator, field: Field, index: Index, turned: NDArray[Any] | None = None
+    rng: np.random.Generator, field: Real, index: Index, turned: NDArray[Any] | None = None
 ) -> Field:
-    """Each block cut from its own random place of a tiling `field`; rotated a quarter where `turned`."""
+    """Each block cut from its own random place of a tiling `field`; a quarter turned where `turned`."""
     size = field.shape[0]
-    rows, columns = np.indices(field.shape, sparse=True)
+    rows, columns = np.arange(size)[:, None], np.arange(size)[None, :]
     offsets = rng.integers(0, size, (2, int(index.max()) + 1))
     down, right = offsets[0][index], offsets[1][index]
     cut = field[(rows + down) % size, (columns + right) % size]
@@ -128,8 +135,8 @@ class Cells:
 
 def cells(
     rng: np.random.Generator,
-    x: Field,
-    y: Field,
+    x: Real,
+    y: Real,
     count: float,
     aspect: float = 1.0,
     jitter: float = 1.0,

@@ -14,6 +14,7 @@ from nets.data.procedural.compose import (
     choose,
     finish,
     lerp,
+    rgb,
     shade,
     shades,
     tilted,
@@ -21,6 +22,7 @@ from nets.data.procedural.compose import (
 from nets.data.procedural.layout import Blocks, basket, courses, herringbone
 from nets.data.procedural.noise import (
     Field,
+    Real,
     bent,
     cells,
     grid,
@@ -70,21 +72,21 @@ def _wood(rng: np.random.Generator, blocks: Blocks, joint: float, board_spread: 
     size = blocks.edge.shape[0]
     timber = _timber(rng, blocks)
     varnish = float(rng.random() < 0.5) * rng.uniform(0.5, 1)
-    wear = patches(spectral(rng, size, 2, slope=1.6), rng.uniform(0, 0.5), 0.4)
+    wear = patches(spectral(rng, size, 2, slope=1.5), rng.uniform(0, 0.5), 1.2)
     board = smoothstep(0, 1.5 * joint, blocks.edge - 0.5 * joint)
     tone = pick(rng, blocks.index)
 
     colour: Colour = shades(rng, choose(rng, _TIMBER), tone, board_spread)
-    colour = blend(colour, colour * np.float32([0.5, 0.42, 0.36]), timber.late * rng.uniform(0.3, 0.9))
+    colour = blend(colour, colour * rgb(0.5, 0.42, 0.36), timber.late * rng.uniform(0.3, 0.9))
     colour = shade(colour, (0.82 + 0.36 * timber.fibre) * (1 - 0.5 * timber.pore))
-    grey = shade(np.float32([0.9, 0.92, 0.95]), 0.9 * colour.mean(-1) + 0.05)
+    grey = shade(rgb(0.9, 0.92, 0.95), 0.9 * colour.mean(-1) + 0.05)
     colour = blend(colour, grey, wear * (1 - varnish) * rng.uniform(0, 0.9))
     colour = blend(colour * np.float32(0.15), colour, board)
 
     relief = rng.uniform(2, 7) * (1 - 0.7 * varnish)
     fine = tilted(0.4 * timber.late + 0.5 * timber.fibre - timber.pore, relief) * board
-    lean = (blocks.across * pick(rng, blocks.index, -1, 1) + 0.4 * blocks.along) * 0.02
-    height = board * (rng.uniform(0.6, 1.2) * joint + 0.3 * joint * tone + lean) + fine
+    askew = (blocks.across * pick(rng, blocks.index, -1, 1) + 0.4 * blocks.along) * 0.02
+    height = board * (rng.uniform(0.6, 1.2) * joint + 0.3 * joint * tone + askew) + fine
 
     raw = 0.75 - 0.15 * timber.late + 0.12 * timber.fibre + 0.1 * timber.pore
     coat = rng.uniform(0.12, 0.4) + 0.06 * (1 - timber.late) + 0.1 * timber.pore + 0.3 * wear
@@ -104,7 +106,7 @@ def wood_planks(rng: np.random.Generator, size: int) -> MaterialMaps:
     return _wood(rng, _upright(blocks, size, x), log_uniform(rng, 0.006, 0.03), rng.uniform(0.1, 0.4))
 
 
-def _upright(blocks: Blocks, size: int, x: Field) -> Blocks:
+def _upright(blocks: Blocks, size: int, x: Real) -> Blocks:
     """The blocks, marked as turned if the coordinates they were laid in were."""
     vertical = abs(float(x[0, -1] - x[0, 0])) < 1
     turned = np.full((size, size), vertical)
