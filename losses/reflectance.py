@@ -50,7 +50,9 @@ def rendering_log_l1(
     repeats = lights.position.shape[0] // estimate.batch
     with torch.no_grad():
         reference = render(truth.map(lambda t: t.repeat(repeats, 1, 1, 1)), lights, camera)
-    return log_l1(render(estimate.map(lambda t: t.repeat(repeats, 1, 1, 1)), lights, camera), reference, offset)
+    return log_l1(
+        render(estimate.map(lambda t: t.repeat(repeats, 1, 1, 1)), lights, camera), reference, offset
+    )
 
 
 def light_l1(estimate: Float[Tensor, "b 3"], truth: Float[Tensor, "b 3"]) -> Float[Tensor, ""]:

@@ -73,7 +73,9 @@ def load_model(name: str | Path = "default") -> Generator:
     network = _load_authors(path) if path.suffix in {".pth", ".pt", ".tar"} else _load_own(path)
     for parameter_name, parameter in network.named_parameters():
         if not bool(torch.isfinite(parameter).all()):
-            raise CheckpointError(f"{path}: {parameter_name} holds NaN or infinite weights; train or fetch it anew")
+            raise CheckpointError(
+                f"{path}: {parameter_name} holds NaN or infinite weights; train or fetch it anew"
+            )
     return network.eval()
 
 
@@ -98,7 +100,9 @@ def read_record(name: str | Path) -> Record:
         with safe_open(path, "pt") as file:
             metadata = file.metadata() or {}
     except (SafetensorError, OSError) as error:
-        raise CheckpointError(f"{path}: not a safetensors file ({error}); give one written by refine-train") from None
+        raise CheckpointError(
+            f"{path}: not a safetensors file ({error}); give one written by refine-train"
+        ) from None
     try:
         header = json.loads(metadata[HEADER_KEY])
         if header.pop("format") != FORMAT:
@@ -106,7 +110,7 @@ def read_record(name: str | Path) -> Record:
         return Record(**{**header, "architecture": GeneratorConfig(**header["architecture"])})
     except (AttributeError, KeyError, TypeError, ValueError):
         raise CheckpointError(
-            f"{path}: a safetensors file, but not a generator of this library; give one written by refine-train"
+            f"{path}: safetensors, but not a generator of this library; give one written by refine-train"
         ) from None
 
 
@@ -127,14 +131,23 @@ def _load_authors(path: Path) -> Generator:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # about pickles that are refused anyway
             state = torch.load(path, map_location="cpu", weights_only=True)
-    except (pickle.UnpicklingError, RuntimeError, EOFError, zipfile.BadZipFile, ValueError, KeyError) as error:
+    except (
+        pickle.UnpicklingError,
+        RuntimeError,
+        EOFError,
+        zipfile.BadZipFile,
+        ValueError,
+        KeyError,
+    ) as error:
         reason = str(error).splitlines()[0] if str(error) else type(error).__name__
         raise CheckpointError(
             f"{path}: refused, it is not a plain file of tensors ({reason[:120]}); "
             "save it anew as a state dict of tensors"
         ) from None
     if not isinstance(state, dict) or not all(isinstance(value, Tensor) for value in state.values()):
-        raise CheckpointError(f"{path}: holds something else than a state dict of tensors; save it anew as one")
+        raise CheckpointError(
+            f"{path}: holds something else than a state dict of tensors; save it anew as one"
+        )
     renamed = from_authors_names({str(name): value for name, value in state.items()})
     first = renamed.get("encoder.0.weight")
     width = int(first.shape[0]) if first is not None and first.ndim == 4 else PAPER_GENERATOR.width
@@ -194,7 +207,9 @@ def _check_shapes(
 ) -> None:
     for name, shape in expected.items():
         if name not in found:
-            raise CheckpointError(f"{path}: another architecture, {name} is missing; load it with its own code")
+            raise CheckpointError(
+                f"{path}: another architecture, {name} is missing; load it with its own code"
+            )
         if found[name] != shape:
             raise CheckpointError(
                 f"{path}: another architecture, {name} has shape {found[name]} where {shape} is expected; "
@@ -202,4 +217,6 @@ def _check_shapes(
             )
     unknown = sorted(set(found) - set(expected))
     if unknown:
-        raise CheckpointError(f"{path}: another architecture, {unknown[0]} is unknown here; load it with its own code")
+        raise CheckpointError(
+            f"{path}: another architecture, {unknown[0]} is unknown here; load it with its own code"
+        )

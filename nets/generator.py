@@ -7,6 +7,7 @@ public checkpoint. What the network sees and says in plain numbers is fixed by `
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass
+from itertools import pairwise
 
 import torch
 from jaxtyping import Float
@@ -114,9 +115,9 @@ def upsampled_convolution(
     upsampled tensor in memory. On two cores this is 2 to 5 times faster, forward and backward.
     """
     flipped = weight.flip(2, 3)
-    kernel = sum(
-        functional.pad(flipped, (left, 1 - left, top, 1 - top)) for left in (0, 1) for top in (0, 1)
-    )
+    kernel = torch.zeros(()).to(flipped)
+    for left, top in ((0, 0), (0, 1), (1, 0), (1, 1)):
+        kernel = kernel + functional.pad(flipped, (left, 1 - left, top, 1 - top))
     return functional.conv_transpose2d(x, kernel.transpose(0, 1), stride=2, padding=2, output_padding=1)
 
 
@@ -156,7 +157,7 @@ class LightHead(nn.Module):
         """Build for a bottleneck of `inputs` channels."""
         super().__init__()
         widths = (inputs, *LIGHT_HEAD_WIDTHS)
-        self.layers = nn.ModuleList(nn.Linear(a, b) for a, b in zip(widths[:-1], widths[1:], strict=True))
+        self.layers = nn.ModuleList(nn.Linear(inputs, outputs) for inputs, outputs in pairwise(widths))
 
     def forward(self, bottleneck: Float[Tensor, "b c h w"]) -> Float[Tensor, "b 3"]:
         """Return the standardised position; a bottleneck larger than 1x1 is averaged first."""
@@ -196,7 +197,9 @@ class Generator(nn.Module):
             features.append(self.encoder_norms[level](x) if level < len(self.encoder_norms) else x)
         return features
 
-    def forward(self, photo: Float[Tensor, "b 3 h w"]) -> tuple[Float[Tensor, "b 10 h w"], Float[Tensor, "b 3"]]:
+    def forward(
+        self, photo: Float[Tensor, "b 3 h w"]
+    ) -> tuple[Float[Tensor, "b 10 h w"], Float[Tensor, "b 3"]]:
         """Map an encoded photo in [-1, 1] to maps in [-1, 1] (order of `MAPS`) and a standardised light.
 
         Raises:
@@ -204,7 +207,9 @@ class Generator(nn.Module):
         """
         multiple = self.config.multiple
         if photo.shape[-1] % multiple or photo.shape[-2] % multiple:
-            raise ValueError(f"photo has shape {tuple(photo.shape)}, its sides must be multiples of {multiple}")
+            raise ValueError(
+                f"photo has shape {tuple(photo.shape)}, its sides must be multiples of {multiple}"
+            )
         features = self.encode(photo)
         maps = torch.cat([self.decoders[name](features) for name in MAPS], dim=1)
         return maps, self.light_head(features[-1])

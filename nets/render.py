@@ -78,9 +78,9 @@ class PointLight:
             torch.tensor([position], dtype=dtype), torch.tensor([rgb], dtype=dtype), falloff=falloff
         )
 
-    def to(self, *args: torch.dtype | torch.device | str) -> PointLight:
-        """Move or cast, with the arguments of `Tensor.to`."""
-        return PointLight(self.position.to(*args), self.intensity.to(*args), self.falloff)
+    def to(self, target: torch.dtype | torch.device | str) -> PointLight:
+        """Cast to a dtype or move to a device."""
+        return PointLight(self.position.to(target), self.intensity.to(target), self.falloff)
 
     def expand(self, batch: int) -> PointLight:
         """Repeat one light over a batch."""

@@ -51,6 +51,4 @@ def cosine_weighted(
     # Malley: a uniform point on the disc of radius sin(max_angle), lifted to the sphere.
     radius = torch.sqrt(u) * math.sin(math.radians(max_angle))
     phi = 2.0 * math.pi * v
-    return torch.stack(
-        [radius * torch.cos(phi), radius * torch.sin(phi), torch.sqrt(1.0 - radius**2)], dim=1
-    )
+    return torch.stack([radius * torch.cos(phi), radius * torch.sin(phi), torch.sqrt(1.0 - radius**2)], dim=1)

@@ -49,9 +49,9 @@ class SVBRDF:
         """Apply one function to each of the four tensors (moving, slicing, casting)."""
         return SVBRDF(*(function(getattr(self, name)) for name in MAPS))
 
-    def to(self, *args: torch.dtype | torch.device | str) -> SVBRDF:
-        """Move or cast all maps, with the arguments of `Tensor.to`."""
-        return self.map(lambda tensor: tensor.to(*args))
+    def to(self, target: torch.dtype | torch.device | str) -> SVBRDF:
+        """Cast all maps to a dtype or move them to a device."""
+        return self.map(lambda tensor: tensor.to(target))
 
     def detach(self) -> SVBRDF:
         """Drop the autograd graph of all maps."""

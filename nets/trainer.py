@@ -117,6 +117,7 @@ class Trainer:
         torch.set_flush_denormal(True)  # dying activations become denormal and several times slower
         torch.manual_seed(self.config.seed)
         self.generator = torch.Generator().manual_seed(self.config.seed)
+        self.rank, self.world = _rank_and_world()
         self.network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
         self.average = copy.deepcopy(self.network).eval().requires_grad_(False)
         self.optimizer = torch.optim.Adam(
@@ -140,14 +141,19 @@ class Trainer:
             loss, terms = self.objective(self.network, batch, self.generator)
         self.optimizer.zero_grad(set_to_none=True)
         loss.backward()
+        if self.world > 1:
+            _average_gradients(list(self.network.parameters()), self.world)
         norm = torch.nn.utils.clip_grad_norm_(self.network.parameters(), self.config.gradient_clip)
         if bool(torch.isfinite(norm)):
             self.optimizer.step()
         self._update_average()
         self.iteration += 1
-        self.samples += phase.batch
+        self.samples += phase.batch * self.world
         self.seconds += time.perf_counter() - start
-        values = {"loss": float(loss.detach()), **{name: float(term.detach()) for name, term in terms.items()}}
+        values = {
+            "loss": float(loss.detach()),
+            **{name: float(term.detach()) for name, term in terms.items()},
+        }
         for name, value in values.items():
             self.averages[name] = 0.98 * self.averages.get(name, value) + 0.02 * value
         return values
@@ -196,3 +202,27 @@ class Trainer:
         torch.set_rng_state(state["torch"])
         self.iteration, self.seconds = state["iteration"], state["seconds"]
         self.samples, self.averages = state["samples"], state["averages"]
+        self.diverge()
+
+    def diverge(self) -> None:
+        """Give every process but the first its own random streams, by rank and iteration."""
+        if self.rank > 0:
+            seed = hash((self.config.seed, self.rank, self.iteration)) % 2**63
+            self.generator.manual_seed(seed)
+            torch.manual_seed(seed)
+
+
+def _rank_and_world() -> tuple[int, int]:
+    if torch.distributed.is_available() and torch.distributed.is_initialized():
+        return torch.distributed.get_rank(), torch.distributed.get_world_size()
+    return 0, 1
+
+
+def _average_gradients(parameters: list[torch.nn.Parameter], world: int) -> None:
+    # One message for all: the network is small and the latency of many would cost more.
+    gradients = [parameter.grad for parameter in parameters if parameter.grad is not None]
+    flat = torch.cat([gradient.reshape(-1) for gradient in gradients])
+    torch.distributed.all_reduce(flat)
+    flat /= world
+    for gradient, part in zip(gradients, flat.split([g.numel() for g in gradients]), strict=True):
+        gradient.copy_(part.view_as(gradient))

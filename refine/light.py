@@ -32,7 +32,7 @@ class LightFit:
 
     Attributes:
         size: longer side of the picture it is fitted on, pixels.
-        evaluations: most evaluations of the rendering per unknown.
+        evaluations: most steps of the solver; each also renders once per unknown for its derivatives.
         residual_scale: encoded difference where the robust loss (soft L1) turns from square to linear.
         prior_weight: of the priors against the mean residual.
     """
@@ -63,7 +63,9 @@ def fit_light(svbrdf: SVBRDF, guess: PointLight, capture: Capture, settings: Lig
 
     normal = small(svbrdf.normal)
     material = svbrdf.map(small)
-    material = SVBRDF(functional.normalize(normal, dim=1), material.diffuse, material.roughness, material.specular)
+    material = SVBRDF(
+        functional.normalize(normal, dim=1), material.diffuse, material.roughness, material.specular
+    )
     target = gamma_encode(small(capture.photo))
     seen = small(capture.unsaturated.float()) > 0.5
     x0, y0, z0 = (float(v) for v in guess.position[0])

@@ -61,7 +61,10 @@ class Parameters:
     def shifted(self, offsets: dict[str, Tensor]) -> Parameters:
         """Add offsets to some maps, by name; they broadcast over pixels or not."""
         return Parameters(
-            *(getattr(self, name) + offsets[name] if name in offsets else getattr(self, name) for name in MAPS)
+            *(
+                getattr(self, name) + offsets[name] if name in offsets else getattr(self, name)
+                for name in MAPS
+            )
         )
 
 

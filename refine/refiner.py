@@ -203,7 +203,9 @@ def run_stages(
         of every stage; `seconds` gains one entry per stage.
     """
     height, width = initial.size
-    geometry = shading_geometry(surface_points(height, width, device=capture.photo.device), light, capture.camera)
+    geometry = shading_geometry(
+        surface_points(height, width, device=capture.photo.device), light, capture.camera
+    )
     with torch.no_grad():
         start = photo_distance(shade(initial, geometry), capture.photo, capture.unsaturated)
     losses = {"initialization": [float(start)]}

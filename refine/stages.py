@@ -13,7 +13,7 @@ from refine.light import LightFit
 
 @dataclass(frozen=True)
 class Rates:
-    """Adam's learning rate of each map's parameters (see `refine.parametrization`); 0 keeps a map as it is."""
+    """Adam's learning rate of each map's parameters, see `refine.parametrization`; 0 keeps a map as it is."""
 
     normal: float = 0.0
     diffuse: float = 0.0
@@ -107,7 +107,7 @@ class Recipe:
 RECIPES: dict[str, Recipe] = {
     "paper": Recipe("paper", stages=(GlobalStage(), PixelStage())),
 }
-"""All recipes by name. `paper` is Ours+ of Table 1: global roughness and specular, then all maps per pixel."""
+"""By name. `paper` is Ours+ of Table 1: global roughness and specular, then every map per pixel."""
 
 
 def find_recipe(name: str) -> Recipe:

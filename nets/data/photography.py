@@ -33,12 +33,12 @@ class FlashPhotography:
 
     centred_share: float = 0.6
     centred_offset: float = 0.25
-    centred_distance: tuple[float, float] = (1.6, 4.0)
+    centred_distance: tuple[float, float] = (1.2, 4.0)
     lights: LightDistribution = LightDistribution(max_angle=60.0, distance_range=(1.0, 8.0))
     exposure_share: float = 0.3
     exposure_deviation: float = 0.15
     balance_deviation: float = 0.05
-    falloff_share: float = 0.15
+    falloff_share: float = 0.3
     noise_range: tuple[float, float] = (0.0, 0.01)
     camera: Camera = Camera()
 
@@ -52,9 +52,7 @@ class FlashPhotography:
         position = torch.where(centred, torch.stack([x, y, z], dim=1), light.position)
         return PointLight(position, light.intensity)
 
-    def take(
-        self, svbrdf: SVBRDF, generator: torch.Generator
-    ) -> tuple[Float[Tensor, "b 3 h w"], PointLight]:
+    def take(self, svbrdf: SVBRDF, generator: torch.Generator) -> tuple[Float[Tensor, "b 3 h w"], PointLight]:
         """Photograph each material once.
 
         Returns:
@@ -76,5 +74,3 @@ class FlashPhotography:
         sigma = low + (high - low) * torch.rand(count, 1, 1, 1, generator=generator)
         encoded = encoded + sigma * torch.randn(encoded.shape, generator=generator)
         return gamma_decode((encoded.clamp(0.0, 1.0) * 255.0).round() / 255.0), light
-
-

@@ -41,7 +41,7 @@ def descend(
         capture: the photo to explain.
         geometry: of the light and camera, fixed.
         iterations: Adam steps.
-        rates: Adam's learning rate by map name, decayed along a half cosine to `FINAL_RATE` of it.
+        rates: Adam's learning rate by map name, decayed along a quarter cosine to `FINAL_RATE` of it.
         progress: told of every iteration.
 
     Returns:
@@ -51,7 +51,8 @@ def descend(
     groups = [{"params": [tensor], "lr": rates[name]} for name, tensor in moving.items()]
     optimizer = torch.optim.Adam(groups, betas=ADAM_BETAS)
     schedule = torch.optim.lr_scheduler.LambdaLR(
-        optimizer, lambda step: FINAL_RATE + (1.0 - FINAL_RATE) * math.cos(math.pi / 2 * step / max(1, iterations))
+        optimizer,
+        lambda step: FINAL_RATE + (1.0 - FINAL_RATE) * math.cos(math.pi / 2 * step / max(1, iterations)),
     )
 
     def distance() -> Tensor:

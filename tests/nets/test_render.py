@@ -500,6 +500,10 @@ CORNERS: dict[str, Callable[[], tuple[SVBRDF, PointLight]]] = {
         SVBRDF.constant(3, 4),
         PointLight.at((PIXEL[0], PIXEL[1], 0.0)),
     ),
+    "a falling light on a pixel of the surface": lambda: (
+        SVBRDF.constant(3, 4),
+        PointLight.at((PIXEL[0], PIXEL[1], 0.0), falloff="inverse_square"),
+    ),
     "a light in the plane beyond the edge": lambda: (SVBRDF.constant(3, 4), PointLight.at((2.0, 0.0, 0.0))),
     "a light below the surface": lambda: (SVBRDF.constant(3, 4), PointLight.at((0.3, 0.0, -1.0))),
     "a light straight opposite the camera": lambda: (SVBRDF.constant(1, 1), PointLight.at((0.0, 0.0, -2.14))),

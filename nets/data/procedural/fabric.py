@@ -11,7 +11,6 @@ from nets.data.procedural.compose import (
     choose,
     dye,
     finish,
-    lerp,
     shade,
     shades,
     tilted,
@@ -67,9 +66,8 @@ def _cloth(rng: np.random.Generator, size: int, cloth: Weave, warp: Real, weft: 
     diffuse = blend(diffuse, np.clip(diffuse * 1.6 + 0.03, 0, 0.9), np.clip(0.5 * fuzz, 0, 1))
     silk = float(rng.random() < 0.3)
     worn = unit(spectral(rng, size, 2, slope=1.5))
-    roughness = (
-        lerp(0.85, rng.uniform(0.35, 0.5), np.full_like(gap, silk)) + 0.1 * gap - 0.1 * worn - 0.04 * twist
-    )
+    fibre = rng.uniform(0.3, 0.5) if silk else rng.uniform(0.65, 0.92)
+    roughness = fibre + 0.1 * gap - 0.1 * worn - 0.04 * twist
     return finish(rng, height, diffuse, roughness, (0.035 + 0.02 * silk) * (1 - 0.4 * gap), grain=1.1)
 
 
@@ -89,7 +87,7 @@ def denim(rng: np.random.Generator, size: int) -> MaterialMaps:
     """Twill: diagonal ribs of dyed warp over pale weft, washed out where it is rubbed."""
     x, y = rotated(*bent(rng, *grid(size), 0.005, low=3), rng.uniform(-0.3, 0.3))
     i, j = np.indices((4, 4))
-    cloth = weave(x, y, log_uniform(rng, 24, 56), (i + j) % 4 > 0, 1.0)
+    cloth = weave(x, y, log_uniform(rng, 32, 80), (i + j) % 4 > 0, 1.0)
     indigo = rng.random() < 0.6
     warp = choose(rng, ("#26364f", "#34496b", "#1d2433", "#5a7592")) if indigo else dye(rng)
     washed = patches(spectral(rng, size, 2, slope=1.6), rng.uniform(0, 0.5), 0.8)
@@ -153,7 +151,7 @@ def carpet(rng: np.random.Generator, size: int) -> MaterialMaps:
         )
     colour = shade(blend(base, fleck, flecks), pick(rng, tuft.index, 0.75, 1.2) * (0.75 + 0.4 * pile))
     diffuse = shade(colour, (0.45 + 0.55 * loop) * (0.9 + 0.2 * trodden))
-    roughness = 0.93 - 0.1 * pile - 0.08 * trodden
+    roughness = rng.uniform(0.78, 0.96) - 0.1 * pile - 0.08 * trodden
     return finish(rng, height, diffuse, roughness, 0.025 + 0.01 * loop, grain=1.5)
 
 

@@ -124,7 +124,7 @@ def diamond_plate(rng: np.random.Generator, size: int) -> MaterialMaps:
     f0 = metal(rng, ("iron", "aluminium", "zinc", "chromium"))
     roughness = rng.uniform(0.25, 0.5) - 0.12 * bar + 0.1 * scratch + 0.04 * rolled
     if rng.random() < 0.3:
-        paint = 1 - patches(bar + 0.5 * rolled, rng.uniform(0.05, 0.3), 0.1)
+        paint = 1 - patches(4 * bar + rolled, rng.uniform(0.02, 0.15), 0.2)  # worn off where feet tread
         diffuse = blend(rgb(0.02, 0.02, 0.02), dye(rng), paint)
         specular = blend(f0, rgb(0.04, 0.04, 0.04), paint)
         return finish(rng, height, diffuse, roughness + 0.1 * paint, specular, grain=0.7)

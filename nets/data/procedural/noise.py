@@ -71,7 +71,7 @@ def smoothstep(low: float, high: float, value: Real) -> Field:
 
 def unit(noise: Real) -> Field:
     """Noise of unit deviation mapped to [0, 1]: two deviations fill the range, the rest saturates."""
-    return np.clip(0.5 + 0.25 * noise, 0, 1)
+    return np.clip(0.5 + 0.25 * noise, 0, 1).astype(np.float32)
 
 
 def patches(noise: Real, coverage: float, softness: float = 0.15) -> Field:
