@@ -15,6 +15,11 @@ from refine.parametrization import Parameters
 
 ADAM_BETAS = (0.9, 0.999)
 
+ADAM_EPSILON = 0.1
+"""Adam steps by g / (|g| + epsilon). A pixel's distance changes by about 1 per unit of its diffuse logit and
+by far less per unit of a normal, or of a roughness outside the highlight. With Adam's usual 1e-8 all of them
+would move alike, and maps the photo hardly depends on would drift: quadrants in normals, roughness noise."""
+
 FINAL_RATE = 0.1
 """Share of the learning rates that is left at the last iteration."""
 
@@ -48,8 +53,10 @@ def descend(
         The parameters with the lowest loss seen, and the loss before every step and after the last.
     """
     moving = {name: offset.detach().clone().requires_grad_(True) for name, offset in offsets.items()}
+    # The gradient of a pixel's own distance, or its average over all pixels where they share one offset.
+    own_pixels = max(offset.shape[-2] * offset.shape[-1] for offset in offsets.values())
     groups = [{"params": [tensor], "lr": rates[name]} for name, tensor in moving.items()]
-    optimizer = torch.optim.Adam(groups, betas=ADAM_BETAS)
+    optimizer = torch.optim.Adam(groups, betas=ADAM_BETAS, eps=ADAM_EPSILON)
     schedule = torch.optim.lr_scheduler.LambdaLR(
         optimizer,
         lambda step: FINAL_RATE + (1.0 - FINAL_RATE) * math.cos(math.pi / 2 * step / max(1, iterations)),
@@ -73,7 +80,7 @@ def descend(
         optimizer.zero_grad(set_to_none=True)
         loss = distance()
         keep(float(loss.detach()))
-        loss.backward()
+        (loss * own_pixels).backward()
         optimizer.step()
         schedule.step()
         if progress is not None:
