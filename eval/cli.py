@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated
 
@@ -22,6 +23,7 @@ from eval.development import (
     refinement_estimator,
     require,
 )
+from eval.photos import find_photos, photos_markdown, score_photos
 from losses.perceptual import LPIPS
 from nets.checkpoint import CheckpointError, load_model
 from nets.data.images import DataError
@@ -95,6 +97,56 @@ def development(
     if results.skipped:
         for name, reason in results.skipped.items():
             errors.print(f"refine-eval: skipped {name}: {reason}", markup=False)
+        raise typer.Exit(INCOMPLETE)
+
+
+@main.command()
+def photos(
+    folders: Annotated[list[Path], typer.Argument(help="Photos, or folders of them.")],
+    init: Annotated[str, typer.Option(help="Checkpoint: a shipped name or a file.")] = "default",
+    recipe: Annotated[str, typer.Option(help=f"One of {', '.join(sorted(RECIPES))}.")] = "paper",
+    iters: Annotated[int | None, typer.Option(min=0, help="Iterations; the recipe's own by default.")] = None,
+    part: Annotated[
+        str, typer.Option(help="K/N: only every N-th photo from the K-th, to share work.")
+    ] = "1/1",
+    threads: Annotated[int, typer.Option(min=0, help="CPU threads; 0 leaves torch's choice.")] = 0,
+    json_file: Annotated[Path | None, typer.Option("--json", help="Write the scores here.")] = None,
+) -> None:
+    """Refine real photos and say whether each is explained, with legal maps."""
+    if threads:
+        torch.set_num_threads(threads)
+    found = find_photos(folders)
+    try:
+        first, step = (int(number) for number in part.split("/"))
+        refiner = Refiner(init, recipe)
+        if not 1 <= first <= step:
+            raise ValueError(f"--part {part} is not K/N with K from 1 to N")
+        if not found:
+            raise ValueError(f"no photos below {', '.join(map(str, folders))}")
+    except ValueError as error:
+        errors.print(f"refine-eval: {error}", markup=False)
+        raise typer.Exit(BAD_USAGE) from None
+
+    found = found[first - 1 :: step]
+    skipped: list[Path] = []
+
+    def skip(path: Path, reason: str) -> None:
+        skipped.append(path)
+        errors.print(f"refine-eval: skipped {path}: {reason}", markup=False)
+
+    scores = []
+    with _progress() as bar:
+        task = bar.add_task("photos", total=len(found))
+        for score in score_photos(refiner, found, iters, skip):
+            scores.append(score)
+            bar.update(task, advance=1, description=score.name[-40:])
+    if scores:
+        typer.echo(photos_markdown(scores), nl=False)
+    if json_file is not None:
+        record = {"init": init, "recipe": recipe, "iters": iters, **provenance()}
+        record["photos"] = [asdict(score) for score in scores]
+        json_file.write_text(json.dumps(record, indent=1) + "\n", encoding="utf-8")
+    if skipped:
         raise typer.Exit(INCOMPLETE)
 
 

@@ -35,7 +35,7 @@ class L1Objective:
 
     map_weight: float = 1.0
     rendering_weight: float = 1.0
-    light_weight: float = 0.2
+    light_weight: float = 1.0
     rendering_lights: int = 2
     rendering_stride: int = 2
     rendering_offset: float = 0.1

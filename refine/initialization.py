@@ -43,7 +43,7 @@ def initialize(model: Predict | Predictor, photo: Float[Tensor, "1 3 h w"]) -> t
         A legal material at the photo's size, and the model's light.
 
     Raises:
-        ValueError: if the model returns maps that are not a legal `SVBRDF`.
+        ValueError: if the model returns anything but a legal `SVBRDF` of the square's size and a light.
     """
     predict = model.predict if isinstance(model, Predictor) else model
     height, width = photo.shape[-2:]
@@ -51,7 +51,7 @@ def initialize(model: Predict | Predictor, photo: Float[Tensor, "1 3 h w"]) -> t
     top, left = (longer - height) // 2, (longer - width) // 2
     square = _mirror_pad(photo, top, longer - height - top, left, longer - width - left)
     with torch.no_grad():
-        svbrdf, light = predict(_resize(square, NETWORK_SIZE))
+        svbrdf, light = _checked(predict(_resize(square, NETWORK_SIZE)))
     whole = svbrdf.detach().map(lambda tensor: _resize(tensor, longer))
     window = (..., slice(top, top + height), slice(left, left + width))
     return legal(whole.map(lambda tensor: tensor[window].contiguous())).validate(), light
@@ -66,6 +66,26 @@ def legal(svbrdf: SVBRDF) -> SVBRDF:
         roughness.clamp(1e-3, 1.0),
         specular.clamp(0.0, 1.0),
     )
+
+
+def _checked(answer: object) -> tuple[SVBRDF, PointLight]:
+    if not isinstance(answer, tuple) or [type(part) for part in answer] != [SVBRDF, PointLight]:
+        raise ValueError(f"the model returned {type(answer).__name__}, expected an SVBRDF and a PointLight")
+    svbrdf, light = answer
+    try:
+        svbrdf.validate()
+    except ValueError as error:
+        raise ValueError(f"the model returned an illegal material: {error}") from None
+    if (svbrdf.batch, *svbrdf.size) != (1, NETWORK_SIZE, NETWORK_SIZE):
+        found, expected = tuple(svbrdf.normal.shape), (1, 3, NETWORK_SIZE, NETWORK_SIZE)
+        raise ValueError(f"the model returned normals of shape {found}, expected {expected}")
+    for name in ("position", "intensity"):
+        values = getattr(light, name)
+        if tuple(values.shape) != (1, 3) or not bool(torch.isfinite(values).all()):
+            raise ValueError(
+                f"the model returned the light's {name} {values.tolist()}, expected [1, 3] numbers"
+            )
+    return svbrdf, light
 
 
 def _resize(tensor: Tensor, side: int) -> Tensor:

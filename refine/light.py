@@ -1,7 +1,8 @@
 """Where the flash was: a small least-squares fit of the light's position to the photo.
 
-The network's light head starts it; the material stays the network's but for a few global corrections,
-which are forgotten afterwards: they only keep errors of the material out of the light.
+The network's light head starts it. The material stays the network's but for three global corrections, which
+are forgotten afterwards: they only keep errors of the material out of the light. What the photo cannot say,
+because the material does not explain it well enough, stays as the light head said.
 """
 
 from __future__ import annotations
@@ -11,19 +12,20 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 from scipy.optimize import least_squares
-from torch import Tensor
-from torch.nn import functional
 
 from nets.color import gamma_encode
-from nets.render import PointLight, render
+from nets.render import PointLight, shade, shading_geometry, surface_points
 from nets.svbrdf import SVBRDF
 from refine.capture import Capture
 
-PRIOR_WIDTHS = (1.0, 1.0, 0.5)
-"""How far the light may plausibly be from the light head's guess: x and y in units of its height, log z."""
+NORMAL_CONSISTENCY = 1.4826
+"""Standard deviation of a normal distribution over its median absolute deviation."""
 
-CORRECTION_WIDTHS = (0.5, 1.0, 0.3)
-"""Plausible global corrections: log of the roughness, log of the specular, log of the diffuse albedo."""
+STEP_SCALES = (0.1, 0.1, 0.1, 0.2, 0.3, 0.1)
+"""Typical changes of the unknowns: x and y in units of the light's height, log height, log corrections."""
+
+BOUNDS = (3.0, 3.0, 1.5, 2.0, 4.0, 1.0)
+"""The unknowns stay within plus and minus this."""
 
 
 @dataclass(frozen=True)
@@ -31,20 +33,52 @@ class LightFit:
     """Settings of the light fit.
 
     Attributes:
-        size: longer side of the picture it is fitted on, pixels.
+        samples: pixels along the longer side that are compared; the photo is sampled, not blurred, so that
+            shading stays exact.
         evaluations: most steps of the solver; each also renders once per unknown for its derivatives.
         residual_scale: encoded difference where the robust loss (soft L1) turns from square to linear.
-        prior_weight: of the priors against the mean residual.
+        loose_prior: weight of the prior in the first pass, which finds how well the material explains the
+            photo at all.
+        prior: weight of the prior in the second pass, in units of the first one's misfit.
+        offset_width: how far the flash may be from the light head's x and y, in units of its height.
+        distance_width: standard deviation of the logarithm of its height around the light head's.
+        roughness_width: of the logarithm of a global correction of the roughness.
+        specular_width: of the specular albedo.
+        diffuse_width: of the diffuse albedo.
     """
 
-    size: int = 48
+    samples: int = 52
     evaluations: int = 40
     residual_scale: float = 0.05
-    prior_weight: float = 0.02
+    loose_prior: float = 0.02
+    prior: float = 0.5
+    offset_width: float = 0.3
+    distance_width: float = 0.2
+    roughness_width: float = 0.5
+    specular_width: float = 1.0
+    diffuse_width: float = 0.3
+
+    @property
+    def widths(self) -> np.ndarray:  # [6]
+        """Prior standard deviations of the six unknowns."""
+        return np.array(
+            [
+                self.offset_width,
+                self.offset_width,
+                self.distance_width,
+                self.roughness_width,
+                self.specular_width,
+                self.diffuse_width,
+            ]
+        )
 
 
 def fit_light(svbrdf: SVBRDF, guess: PointLight, capture: Capture, settings: LightFit) -> PointLight:
     """Fit the light's position to the photo, from a guess.
+
+    Two passes of the same robust least squares (scipy, trust region reflective). The first nearly ignores the
+    prior. Its misfit says how far the network's material is to be trusted, and so how much the second one
+    leaves the guess: a perfect material finds the light to a percent, a poor one cannot drag it away.
 
     Args:
         svbrdf: the initialization, at the photo's size.
@@ -55,28 +89,20 @@ def fit_light(svbrdf: SVBRDF, guess: PointLight, capture: Capture, settings: Lig
     Returns:
         The light with the fitted position, float32.
     """
-    scale = settings.size / max(svbrdf.size)
-    size = [max(1, round(side * scale)) for side in svbrdf.size]
+    stride = max(1, max(svbrdf.size) // settings.samples)
+    pixels = (..., slice(stride // 2, None, stride), slice(stride // 2, None, stride))
+    material = svbrdf.map(lambda tensor: tensor[pixels].double().cpu())
+    points = surface_points(*svbrdf.size, dtype=torch.float64)[pixels]
+    target = gamma_encode(capture.photo[pixels].double().cpu())
+    unsaturated = capture.unsaturated[pixels].cpu()
+    intensity = guess.intensity.double().cpu()
+    x, y, z = (float(value) for value in guess.position[0])
 
-    def small(tensor: Tensor) -> Tensor:
-        return functional.interpolate(tensor.double(), size=size, mode="area")
+    def light_at(unknowns: np.ndarray) -> PointLight:  # [6]
+        position = [x + unknowns[0] * z, y + unknowns[1] * z, z * np.exp(unknowns[2])]
+        return PointLight(torch.tensor([position], dtype=torch.float64), intensity, guess.falloff)
 
-    normal = small(svbrdf.normal)
-    material = svbrdf.map(small)
-    material = SVBRDF(
-        functional.normalize(normal, dim=1), material.diffuse, material.roughness, material.specular
-    )
-    target = gamma_encode(small(capture.photo))
-    seen = small(capture.unsaturated.float()) > 0.5
-    x0, y0, z0 = (float(v) for v in guess.position[0])
-    weight = settings.prior_weight * np.sqrt(target.numel())
-
-    def light_at(unknowns: np.ndarray) -> PointLight:
-        z = z0 * np.exp(unknowns[2])
-        position = torch.tensor([[x0 + unknowns[0] * z0, y0 + unknowns[1] * z0, z]], dtype=torch.float64)
-        return PointLight(position, guess.intensity.double(), guess.falloff)
-
-    def residuals(unknowns: np.ndarray) -> np.ndarray:
+    def differences(unknowns: np.ndarray) -> np.ndarray:  # [6] -> [3 h w]
         roughness, specular, diffuse = np.exp(unknowns[3:])
         corrected = SVBRDF(
             material.normal,
@@ -84,19 +110,25 @@ def fit_light(svbrdf: SVBRDF, guess: PointLight, capture: Capture, settings: Lig
             (material.roughness * roughness).clamp(1e-3, 1.0),
             (material.specular * specular).clamp(max=1.0),
         )
-        rendering = gamma_encode(render(corrected, light_at(unknowns), capture.camera))
-        difference = torch.where(seen, rendering - target, torch.relu(target - rendering))
-        prior = weight * unknowns / np.array([*PRIOR_WIDTHS, *CORRECTION_WIDTHS])
-        return np.concatenate([difference.numpy().ravel(), prior * settings.residual_scale])
+        rendering = gamma_encode(
+            shade(corrected, shading_geometry(points, light_at(unknowns), capture.camera))
+        )
+        return torch.where(unsaturated, rendering - target, (target - rendering).relu()).numpy().ravel()
 
-    solution = least_squares(
-        residuals,
-        np.zeros(6),
-        loss="soft_l1",
-        f_scale=settings.residual_scale,
-        x_scale=np.array([0.1, 0.1, 0.1, 0.2, 0.3, 0.1]),
-        max_nfev=settings.evaluations,
-        bounds=([-3, -3, -1.5, -2, -4, -1], [3, 3, 1.5, 2, 4, 1]),
-    )
-    fitted = light_at(solution.x)
-    return PointLight(fitted.position.float(), guess.intensity, guess.falloff)
+    def solve(prior: float) -> np.ndarray:  # [6]
+        weights = prior * np.sqrt(target.numel()) / settings.widths
+        solution = least_squares(
+            lambda unknowns: np.concatenate([differences(unknowns), weights * unknowns]),
+            np.zeros(len(BOUNDS)),
+            loss="soft_l1",
+            f_scale=settings.residual_scale,
+            x_scale=STEP_SCALES,
+            max_nfev=settings.evaluations,
+            bounds=(-np.array(BOUNDS), np.array(BOUNDS)),
+        )
+        return np.asarray(solution.x)
+
+    loose = solve(settings.loose_prior * settings.residual_scale)
+    misfit = NORMAL_CONSISTENCY * float(np.median(np.abs(differences(loose))))
+    fitted = light_at(solve(settings.prior * misfit))
+    return PointLight(fitted.position.float(), guess.intensity.float().cpu(), guess.falloff)

@@ -159,8 +159,10 @@ class Refiner:
         photo = _photo(img, color_space)
         if self.resolution is not None:
             photo = resize_photo(photo, self.resolution)
+        # Light above 1 (float files, colours outside Rec. 709) is clipped here: it then says "at least 1".
+        unsaturated = photo.unsaturated & (photo.linear <= 1.0).all(dim=1, keepdim=True)
         capture = Capture(
-            photo.linear.clamp(max=1.0).to(self.device), photo.unsaturated.to(self.device), self.camera, light
+            photo.linear.clamp(max=1.0).to(self.device), unsaturated.to(self.device), self.camera, light
         )
         seconds: dict[str, float] = {}
 

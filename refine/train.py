@@ -53,8 +53,9 @@ def batch_source(
             entry alike.
     """
     camera = photography or FlashPhotography()
-    held = {entry.kind for entry in pool.index} | {entry.collection for entry in pool.index}
-    present = {name: share for name, share in (shares or {}).items() if name in held} or None
+    wanted = shares or {}
+    held = {entry.collection if entry.collection in wanted else entry.kind for entry in pool.index}
+    present = {name: share for name, share in wanted.items() if name in held} or None
 
     def source(batch: int, crop: int, generator: torch.Generator) -> TrainingBatch:
         material = decode(pool.sample(batch, generator, present))
@@ -113,6 +114,12 @@ def train(
     try:
         config = TrainerConfig(phases=parse_phases(phases), learning_rate=learning_rate, seed=seed)
         architecture = GeneratorConfig(width, levels, deep_multiplier)
+        for phase in config.phases:
+            if phase.crop % architecture.multiple:
+                raise ValueError(
+                    f"--phases {phases!r} has a crop of {phase.crop} pixels; "
+                    f"{levels} levels need multiples of {architecture.multiple}"
+                )
         materials = MaterialPool(pool, part="train")
     except (DataError, ValueError) as error:
         typer.echo(f"refine-train: {error}", err=True)
