@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from dataclasses import asdict
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import torch
 import typer
@@ -143,7 +143,7 @@ def photos(
     if scores:
         typer.echo(photos_markdown(scores), nl=False)
     if json_file is not None:
-        record = {"init": init, "recipe": recipe, "iters": iters, **provenance()}
+        record: dict[str, Any] = {"init": init, "recipe": recipe, "iters": iters, **provenance()}
         record["photos"] = [asdict(score) for score in scores]
         json_file.write_text(json.dumps(record, indent=1) + "\n", encoding="utf-8")
     if skipped:
