@@ -34,9 +34,9 @@ class L1Objective:
     """
 
     map_weight: float = 1.0
-    rendering_weight: float = 1.0
+    rendering_weight: float = 10.0
     light_weight: float = 1.0
-    rendering_lights: int = 2
+    rendering_lights: int = 3
     rendering_stride: int = 2
     rendering_offset: float = 0.1
     lights: LightDistribution = LightDistribution(max_angle=60.0, distance_range=(1.0, 8.0))

@@ -38,7 +38,7 @@ def rendering_log_l1(
     camera: Camera | None = None,
     offset: float = LOG_OFFSET,
 ) -> Float[Tensor, ""]:
-    """Return the log L1 distance of both materials rendered under the same lights.
+    """Return the log L1 distance of both materials rendered under the same lights, white from 1 on.
 
     Args:
         estimate: a batch of materials.
@@ -48,11 +48,12 @@ def rendering_log_l1(
         offset: see `log_l1`; a larger one cares less for dark pixels.
     """
     repeats = lights.position.shape[0] // estimate.batch
+    rendering = render(estimate.map(lambda t: t.repeat(repeats, 1, 1, 1)), lights, camera)
     with torch.no_grad():
         reference = render(truth.map(lambda t: t.repeat(repeats, 1, 1, 1)), lights, camera)
-    return log_l1(
-        render(estimate.map(lambda t: t.repeat(repeats, 1, 1, 1)), lights, camera), reference, offset
-    )
+    # A picture is white from 1 on: there, brighter is not wrong, and darker only as far as one can see.
+    rendering = torch.where(reference < 1.0, rendering, rendering.clamp(max=1.0))
+    return log_l1(rendering, reference.clamp(max=1.0), offset)
 
 
 def light_l1(estimate: Float[Tensor, "b 3"], truth: Float[Tensor, "b 3"]) -> Float[Tensor, ""]:

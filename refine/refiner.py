@@ -217,13 +217,15 @@ def run_stages(
     finished = 0
     for stage in recipe.stages:
         clock = time.perf_counter()
+        count = sum(name.split(" ")[0] == stage.name for name in losses)
+        label = f"{stage.name} {count + 1}" if count else stage.name
         offsets = {name: zero.to(capture.photo.device) for name, zero in stage.offsets(height, width).items()}
 
-        def tell(iteration: int, loss: float, name: str = stage.name, before: int = finished) -> None:
+        def tell(iteration: int, loss: float, name: str = label, before: int = finished) -> None:
             if progress is not None:
                 progress(name, before + iteration, recipe.iterations, loss)
 
-        parameters, losses[stage.name] = descend(
+        parameters, losses[label] = descend(
             parameters,
             offsets,
             capture,
@@ -233,7 +235,7 @@ def run_stages(
             progress=tell,
         )
         finished += stage.iterations
-        seconds[stage.name] = time.perf_counter() - clock
+        seconds[label] = time.perf_counter() - clock
     return parameters.svbrdf(), losses
 
 

@@ -31,7 +31,7 @@ POOL_SHARES = {"procedural": 0.5, "pbr": 0.3, "infinigen": 0.2}
 AUGMENTATION = Augmentation(specular=0.4, exposure=0.4)
 """Wider than the default in specular and albedo: few training materials lie between plastic and metal."""
 
-DEFAULT_PHASES = "4500:128:8,2500:256:4"
+DEFAULT_PHASES = "3500:128:8,3500:256:4"
 
 LOG_EVERY = 50
 """Iterations between lines of the log."""
@@ -99,6 +99,7 @@ def train(
         int, typer.Option(help="Widest layer as a multiple of the width; 8 in the paper.")
     ] = NARROW_GENERATOR.deep_multiplier,
     learning_rate: Annotated[float, typer.Option(help="Adam's peak learning rate.")] = 8e-4,
+    ema_decay: Annotated[float, typer.Option(help="Of the moving average that is written.")] = 0.999,
     seed: Annotated[int, typer.Option(help="Seed of weights, data and dropout.")] = 0,
     threads: Annotated[int, typer.Option(help="CPU threads of each process.")] = 1,
     resume: Annotated[bool, typer.Option(help="Continue from the run's state if there is one.")] = False,
@@ -112,7 +113,9 @@ def train(
     if "RANK" in os.environ:
         torch.distributed.init_process_group("gloo")
     try:
-        config = TrainerConfig(phases=parse_phases(phases), learning_rate=learning_rate, seed=seed)
+        config = TrainerConfig(
+            phases=parse_phases(phases), learning_rate=learning_rate, ema_decay=ema_decay, seed=seed
+        )
         architecture = GeneratorConfig(width, levels, deep_multiplier)
         for phase in config.phases:
             if phase.crop % architecture.multiple:
