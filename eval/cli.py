@@ -25,7 +25,7 @@ from eval.development import (
 )
 from eval.photos import find_photos, photos_markdown, score_photos
 from losses.perceptual import LPIPS
-from nets.checkpoint import CheckpointError, load_model
+from nets.checkpoint import CheckpointError
 from nets.data.images import DataError
 from refine.refiner import Refiner
 from refine.stages import RECIPES, find_recipe
@@ -56,6 +56,7 @@ def development(
     lights: Annotated[int, typer.Option(min=1, help="Novel lights per scene.")] = NOVEL_LIGHTS,
     seed: Annotated[int, typer.Option(min=0, help="Of the novel lights and of refinement.")] = 0,
     estimate_light: Annotated[bool, typer.Option(help="Do not tell the method the photo's light.")] = False,
+    flips: Annotated[bool, typer.Option(help="Average the network over four mirrored photos.")] = True,
     stored_input: Annotated[bool, typer.Option(help="Use the photos stored in strips.")] = False,
     threads: Annotated[int, typer.Option(min=0, help="CPU threads; 0 leaves torch's choice.")] = 0,
     json_file: Annotated[Path | None, typer.Option("--json", help="Write everything here.")] = None,
@@ -67,7 +68,7 @@ def development(
     try:
         require(data, DEVELOPMENT)
         chosen = find_recipe("paper" if recipe == "none" else recipe)
-        refiner = Refiner(load_model(init), chosen, resolution=size, seed=seed)
+        refiner = Refiner(init, chosen, resolution=size, flips=flips, seed=seed)
     except (DataError, CheckpointError, ValueError) as error:
         errors.print(f"refine-eval: {error}", markup=False)
         raise typer.Exit(BAD_USAGE) from None
@@ -85,7 +86,13 @@ def development(
             LPIPS(),
             progress=lambda name: bar.update(task, advance=1, description=name[:40]),
         )
-    results.settings |= {"init": init, "recipe": recipe, "iters": iters, "estimate_light": estimate_light}
+    results.settings |= {
+        "init": init,
+        "recipe": recipe,
+        "iters": iters,
+        "estimate_light": estimate_light,
+        "flips": flips,
+    }
     results.settings |= provenance()
 
     table = markdown(results)

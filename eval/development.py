@@ -281,7 +281,8 @@ def caption(settings: Mapping[str, Any]) -> str:
     return (
         f"RMSE (maps linear; D gamma, S gamma and renderings encoded with 1/2.2) and LPIPS v0.1 AlexNet on "
         f"{', '.join(settings['sets'])}; {settings['size']} px, {settings['lights']} novel lights per scene, "
-        f"seed {settings['seed']}; photo {photo}, its light {light}; checkpoint {settings.get('init', '?')}; "
+        f"seed {settings['seed']}; photo {photo}, its light {light}; checkpoint {settings.get('init', '?')}"
+        f"{', averaged over four flips' if settings.get('flips') else ''}; "
         f"commit {settings.get('commit', '?')}; {settings.get('machine', '?')}."
     )
 

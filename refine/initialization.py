@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Protocol, runtime_checkable
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 from torch.nn import functional
 
+from nets.ensemble import Predictor
 from nets.render import PointLight
 from nets.svbrdf import MAPS, SVBRDF
 
@@ -18,15 +18,6 @@ NETWORK_SIZE = 256
 
 Predict = Callable[[Float[Tensor, "1 3 256 256"]], tuple[SVBRDF, PointLight]]
 """Linear square photo to material and light: all that refinement asks of a model."""
-
-
-@runtime_checkable
-class Predictor(Protocol):
-    """A model with a `predict` method, as `nets.generator.Generator` has."""
-
-    def predict(self, photo: Tensor) -> tuple[SVBRDF, PointLight]:
-        """Estimate material and light of a linear photo."""
-        ...
 
 
 def initialize(model: Predict | Predictor, photo: Float[Tensor, "1 3 h w"]) -> tuple[SVBRDF, PointLight]:

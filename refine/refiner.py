@@ -14,6 +14,7 @@ from torch import Tensor
 
 from losses.refinement import photo_distance
 from nets.checkpoint import load_model
+from nets.ensemble import FlipAverage
 from nets.render import Camera, PointLight, render, shade, shading_geometry, surface_points
 from nets.svbrdf import SVBRDF
 from refine.capture import Capture
@@ -102,6 +103,7 @@ class Refiner:
         *,
         camera: Camera | None = None,
         resolution: int | None = DEFAULT_RESOLUTION,
+        flips: bool = True,
         seed: int = 0,
         device: str | torch.device = "cpu",
     ) -> None:
@@ -113,6 +115,7 @@ class Refiner:
             recipe: a name in `refine.stages.RECIPES`, or a `Recipe`.
             camera: how the photo was taken; the authors' perspective camera by default.
             resolution: longer side of the maps in pixels; None keeps the photo's.
+            flips: average a named checkpoint's guess over four mirrored photos (`nets.ensemble`).
             seed: of everything random, for models or recipes that draw numbers.
             device: where to compute.
 
@@ -124,7 +127,7 @@ class Refiner:
         if isinstance(model, str | Path):
             network = load_model(model)
             network.to(self.device)
-            model = network
+            model = FlipAverage(network) if flips else network
         self.model = model
         self.recipe = find_recipe(recipe) if isinstance(recipe, str) else recipe
         self.camera = camera or Camera()

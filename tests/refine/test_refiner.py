@@ -131,7 +131,7 @@ def test_a_checkpoint_is_a_model(tmp_path: Path) -> None:
     save_model(tmp_path / "net.safetensors", network, Record(shape))
     network.half().float()  # as stored
     for name in (tmp_path / "net.safetensors", str(tmp_path / "net.safetensors")):
-        found = Refiner(name).fit(picture(), iters=0)
+        found = Refiner(name, flips=False).fit(picture(), iters=0)
         expected = Refiner(network).fit(picture(), iters=0)
         assert_close(found.svbrdf.channels(), expected.svbrdf.channels())
         assert_close(found.light.position, expected.light.position)

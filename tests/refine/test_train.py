@@ -1,4 +1,4 @@
-"""`refine-train`: what it is asked, what it draws from a pool, and a tiny training from pool to checkpoint."""
+"""`refine-train`: what it is asked, what it draws from a pool, and a tiny training from end to end."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import json
 from collections import Counter
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
@@ -131,29 +132,23 @@ def test_shares_of_what_the_pool_lacks_are_left_out(
         entry(f"{kind}__{seed}", "procedural" if kind == "procedural" else "pbr", kind, seed)
         for seed, kind in enumerate(kinds)
     ]
-    opened = MaterialPool(write_pool(tmp_path / "pool", *entries))
-    stored = {kind: opened[index] for index, kind in enumerate(kinds)}
-    draws = 400
+    draws, counted = 400, Counter[str]()
 
-    class Watched:
-        index, counted = opened.index, Counter[str]()
+    class Watched(MaterialPool):
+        """Counts what a large batch would hold."""
 
-        def sample(self, *arguments: object) -> torch.Tensor:
-            drawn = opened.sample(draws, *arguments[1:])  # type: ignore[arg-type]
-            for kind, tile in stored.items():
-                self.counted[kind] += int((drawn == tile).all(dim=(1, 2, 3)).sum())
-            return drawn[:1]
+        def sample(self, *arguments: Any) -> torch.Tensor:
+            drawn = super().sample(draws, *arguments[1:])
+            for position, kind in enumerate(kinds):
+                counted[kind] += int((drawn == self[position]).all(dim=3).all(dim=2).all(dim=1).sum())
+            return drawn[: arguments[0]]
 
-    watched = Watched()
-    patch = pytest.MonkeyPatch()
-    patch.setattr(train, "MaterialPool", Watched)
-    try:
-        source = batch_source.__wrapped__ if hasattr(batch_source, "__wrapped__") else batch_source
-        source(watched, Augmentation.none(), None, POOL_SHARES)(1, 32, seeded(0))  # type: ignore[arg-type]
-    finally:
-        patch.undo()
-    assert sum(watched.counted.values()) == draws
-    found = {kind: count / draws for kind, count in watched.counted.items()}
+    source = batch_source(
+        Watched(write_pool(tmp_path / "pool", *entries)), Augmentation.none(), shares=POOL_SHARES
+    )
+    source(1, 32, seeded(0))
+    assert sum(counted.values()) == draws
+    found = {kind: count / draws for kind, count in counted.items()}
     assert found == pytest.approx(expected, abs=0.08)
 
 
