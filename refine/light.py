@@ -51,7 +51,7 @@ class LightFit:
     evaluations: int = 40
     residual_scale: float = 0.05
     loose_prior: float = 0.02
-    prior: float = 0.5
+    prior: float = 0.25
     offset_width: float = 0.3
     distance_width: float = 0.2
     roughness_width: float = 0.5

@@ -29,8 +29,8 @@ class Rates:
 class GlobalStage:
     """Move some maps as a whole: every pixel by the gradient averaged over all pixels (paper Sec. 6.1)."""
 
-    iterations: int = 100
-    rates: Rates = Rates(roughness=0.02, specular=0.02)
+    iterations: int = 40
+    rates: Rates = Rates(roughness=0.005, specular=0.005)
 
     @property
     def name(self) -> str:
@@ -46,8 +46,8 @@ class GlobalStage:
 class PixelStage:
     """Move some maps pixel by pixel."""
 
-    iterations: int = 400
-    rates: Rates = Rates(normal=0.01, diffuse=0.03, roughness=0.005, specular=0.005)
+    iterations: int = 260
+    rates: Rates = Rates(normal=0.0015, diffuse=0.01, roughness=0.0006, specular=0.006)
 
     @property
     def name(self) -> str:
