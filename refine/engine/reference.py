@@ -62,8 +62,17 @@ def descend(
         lambda step: FINAL_RATE + (1.0 - FINAL_RATE) * math.cos(math.pi / 2 * step / max(1, iterations)),
     )
 
+    # A clipped pixel cannot say which of its maps is wrong: of itself it keeps what it had. It still counts
+    # where all pixels move together.
+    own = {name: offset.shape[-2:] == capture.photo.shape[-2:] for name, offset in offsets.items()}
+
+    def moved(values: dict[str, Tensor]) -> Parameters:
+        return start.shifted(
+            {name: value * capture.unsaturated if own[name] else value for name, value in values.items()}
+        )
+
     def distance() -> Tensor:
-        rendering = shade(start.shifted(moving).svbrdf(), geometry)
+        rendering = shade(moved(moving).svbrdf(), geometry)
         return photo_distance(rendering, capture.photo, capture.unsaturated)
 
     history: list[float] = []
@@ -87,4 +96,4 @@ def descend(
             progress(iteration + 1, history[-1])
     with torch.no_grad():
         keep(float(distance()))
-    return start.shifted(best), history
+    return moved(best), history
