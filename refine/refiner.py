@@ -162,8 +162,8 @@ class Refiner:
         photo = _photo(img, color_space)
         if self.resolution is not None:
             photo = resize_photo(photo, self.resolution)
-        # Light above 1 (float files, colours outside Rec. 709) is clipped here: it then says "at least 1".
-        unsaturated = photo.unsaturated & (photo.linear <= 1.0).all(dim=1, keepdim=True)
+        # Light of 1 and more is clipped, whatever the file's own range is: it only says "at least 1".
+        unsaturated = photo.unsaturated & (photo.linear < 1.0).all(dim=1, keepdim=True)
         capture = Capture(
             photo.linear.clamp(max=1.0).to(self.device), unsaturated.to(self.device), self.camera, light
         )
