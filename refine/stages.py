@@ -10,6 +10,9 @@ import torch
 from nets.svbrdf import CHANNELS, MAPS
 from refine.light import LightFit
 
+LARGEST_SPEEDUP = 6.0
+"""Most that rates are raised when a recipe is asked for fewer iterations than its own."""
+
 
 @dataclass(frozen=True)
 class Rates:
@@ -19,6 +22,10 @@ class Rates:
     diffuse: float = 0.0
     roughness: float = 0.0
     specular: float = 0.0
+
+    def scaled(self, factor: float) -> Rates:
+        """Return all rates times a factor."""
+        return Rates(*(getattr(self, name) * factor for name in MAPS))
 
     def moving(self) -> dict[str, float]:
         """Return the rates that are not zero, by map name."""
@@ -82,15 +89,20 @@ class Recipe:
         return sum(stage.iterations for stage in self.stages)
 
     def with_iterations(self, total: int) -> Recipe:
-        """Return this recipe with its stages scaled so that they take `total` steps together."""
+        """Return this recipe with its stages scaled so that they take `total` steps together.
+
+        Rates are scaled the other way, up to `LARGEST_SPEEDUP`: fewer steps go as far with longer ones, and
+        more steps follow the same path more finely instead of drifting on.
+        """
         if total < 0:
             raise ValueError(f"iterations must be 0 or more, got {total}")
         ends = [0]
         for stage in self.stages:
             ends.append(ends[-1] + stage.iterations)
+        pace = min(LARGEST_SPEEDUP, ends[-1] / max(1, total))
         marks = [round(end * total / max(1, ends[-1])) for end in ends]
         stages = tuple(
-            replace(stage, iterations=after - before)
+            replace(stage, iterations=after - before, rates=stage.rates.scaled(pace))
             for stage, before, after in zip(self.stages, marks[:-1], marks[1:], strict=True)
         )
         return replace(self, stages=stages)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from dataclasses import replace
+from dataclasses import astuple, replace
 
 import pytest
 from hypothesis import given
@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from nets.svbrdf import CHANNELS, MAPS
 from refine.light import LightFit
 from refine.parametrization import Parameters
-from refine.stages import RECIPES, GlobalStage, PixelStage, Rates, Recipe, find_recipe
+from refine.stages import LARGEST_SPEEDUP, RECIPES, GlobalStage, PixelStage, Rates, Recipe, find_recipe
 from tests.helpers import random_svbrdf
 
 
@@ -33,7 +33,9 @@ def test_scaling_keeps_the_total_the_shares_and_everything_else(iterations: list
     for before, after in zip(recipe.stages, scaled.stages, strict=True):
         assert after.iterations >= 0
         assert abs(after.iterations - before.iterations * total / recipe.iterations) <= 1.0
-        assert replace(after, iterations=before.iterations) == before
+        assert replace(after, iterations=before.iterations, rates=before.rates) == before
+        pace = min(LARGEST_SPEEDUP, recipe.iterations / max(1, total))
+        assert astuple(after.rates) == pytest.approx([rate * pace for rate in astuple(before.rates)])
     assert (scaled.name, scaled.light_fit) == (recipe.name, recipe.light_fit)
 
 
