@@ -51,7 +51,9 @@ def offered(module: str) -> frozenset[str]:
     loaded = importlib.import_module(module)
     for app in vars(loaded).values():
         if isinstance(app, typer.Typer):
-            return frozenset(option for parameter in get_command(app).params for option in parameter.opts)
+            command = get_command(app)
+            every = [command, *getattr(command, "commands", {}).values()]
+            return frozenset(option for one in every for parameter in one.params for option in parameter.opts)
     said = io.StringIO()
     with pytest.MonkeyPatch.context() as patch, contextlib.redirect_stdout(said):
         patch.setattr(sys, "argv", [module, "--help"])
@@ -82,7 +84,7 @@ def test_the_python_example_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 
 
 def test_commands_are_found() -> None:
-    assert {words[0] for words in commands()} == {"refine", "refine-train", "python"}
+    assert {words[0] for words in commands()} == {"refine", "refine-train", "refine-eval", "python"}
     assert any("--iters" in words for words in commands())
 
 

@@ -178,13 +178,16 @@ def test_a_perfect_method_scores_zero_and_a_constant_does_not(data: Path) -> Non
 
 
 class FakeModel:
+    def to(self, device: torch.device) -> "FakeModel":
+        return self
+
     def predict(self, photo: torch.Tensor) -> tuple[SVBRDF, PointLight]:
         return grey(photo), PointLight.at((0.0, 0.0, 2.0))
 
 
 @pytest.fixture
 def run(monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(cli, "load_model", lambda name: FakeModel())
+    monkeypatch.setattr("refine.refiner.load_model", lambda name: FakeModel())
 
     def invoke(*arguments: str):
         return CliRunner().invoke(cli.main, ["development", "--size", "64", "--lights", "2", *arguments])
