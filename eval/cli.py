@@ -73,6 +73,7 @@ def development(
         errors.print(f"refine-eval: {error}", markup=False)
         raise typer.Exit(BAD_USAGE) from None
 
+    origin = provenance()  # of the code that runs, whatever is committed meanwhile
     estimator = refinement_estimator(refiner, 0 if recipe == "none" else iters, estimate_light=estimate_light)
     protocol = Protocol(size=size, lights=lights, seed=seed, stored_input=stored_input)
     with _progress() as bar:
@@ -93,7 +94,7 @@ def development(
         "estimate_light": estimate_light,
         "flips": flips,
     }
-    results.settings |= provenance()
+    results.settings |= origin
 
     table = markdown(results)
     typer.echo(table, nl=False)
@@ -134,6 +135,7 @@ def photos(
         errors.print(f"refine-eval: {error}", markup=False)
         raise typer.Exit(BAD_USAGE) from None
 
+    origin = provenance()
     found = found[first - 1 :: step]
     skipped: list[Path] = []
 
@@ -150,7 +152,7 @@ def photos(
     if scores:
         typer.echo(photos_markdown(scores), nl=False)
     if json_file is not None:
-        record: dict[str, Any] = {"init": init, "recipe": recipe, "iters": iters, **provenance()}
+        record: dict[str, Any] = {"init": init, "recipe": recipe, "iters": iters, **origin}
         record["photos"] = [asdict(score) for score in scores]
         json_file.write_text(json.dumps(record, indent=1) + "\n", encoding="utf-8")
     if skipped:

@@ -230,7 +230,7 @@ def _with_falloff(model: Any, falloff: Literal["none", "inverse_square"]) -> Cal
     # The same model, whose light falls off as the user says; networks do not predict that.
     from dataclasses import replace
 
-    from refine.initialization import Predictor
+    from nets.ensemble import Predictor
 
     predict = model.predict if isinstance(model, Predictor) else model
 
