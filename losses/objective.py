@@ -25,6 +25,8 @@ class L1Objective:
 
     Attributes:
         map_weight: of the sum of the four map terms.
+        normal_factor: of the normal term within that sum; normals carry most of the error of renderings
+            under new lights, yet their own L1 is the smallest of the four and hardly felt at 1.
         rendering_weight: of the rendering term.
         light_weight: of the light term.
         rendering_lights: random lights per material.
@@ -34,6 +36,7 @@ class L1Objective:
     """
 
     map_weight: float = 1.0
+    normal_factor: float = 5.0
     rendering_weight: float = 10.0
     light_weight: float = 1.0
     rendering_lights: int = 3
@@ -60,7 +63,8 @@ class L1Objective:
         )
         terms["light"] = light_l1(light.float(), light_to_output(batch.light.position))
         loss = (
-            self.map_weight * sum((terms[name] for name in MAPS), torch.zeros(()))
+            self.map_weight
+            * (sum(terms[name] for name in MAPS) + (self.normal_factor - 1.0) * terms["normal"])
             + self.rendering_weight * terms["rendering"]
             + self.light_weight * terms["light"]
         )

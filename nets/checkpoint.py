@@ -158,7 +158,7 @@ def _load_authors(path: Path) -> Generator:
     return network
 
 
-def _without_weights(path: Path, architecture: dict[str, int]) -> Generator:
+def _without_weights(path: Path, architecture: dict[str, Any]) -> Generator:
     try:
         with torch.device("meta"):
             return Generator(GeneratorConfig(**architecture))

@@ -16,12 +16,16 @@ from torch.nn import functional
 
 from nets.color import to_network_input
 from nets.render import PointLight
+from nets.shading_cues import CUES, shading_cues
 from nets.svbrdf import CHANNELS, MAPS, SVBRDF
 
 LEAKY_SLOPE = 0.2
 DROPOUT = 0.5
 DROPOUT_LEVELS = 3
 """Dropout follows this many of the deepest decoder levels."""
+
+DETAIL_FEATURES = 2
+"""Channels beyond its map that each decoder hands to the full-resolution layers."""
 
 LIGHT_HEAD_WIDTHS = (256, 128, 64, 32, 16, 3)
 
@@ -47,15 +51,25 @@ class GeneratorConfig:
         width: channels of the first convolution; 64 in the paper.
         levels: stride-2 convolutions of the encoder; 8 in the paper, so that 256 px shrink to 1.
         deep_multiplier: cap of the channels as a multiple of `width`; 8 in the paper.
+        shading_cues: whether the network also sees `nets.shading_cues`; not in the paper.
+        detail_channels: of the full-resolution layers that see decoder and input together, see `Detail`; 0
+            leaves them out, as the paper does.
     """
 
     width: int = 64
     levels: int = 8
     deep_multiplier: int = 8
+    shading_cues: bool = False
+    detail_channels: int = 0
 
     def __post_init__(self) -> None:
         """Refuse shapes that cannot be built."""
-        if self.width < 1 or self.deep_multiplier < 1 or not 2 <= self.levels <= 10:
+        if (
+            self.width < 1
+            or self.deep_multiplier < 1
+            or self.detail_channels < 0
+            or not 2 <= self.levels <= 10
+        ):
             raise ValueError(f"not a generator: {self}")
 
     @property
@@ -64,17 +78,24 @@ class GeneratorConfig:
         return tuple(self.width * min(2**level, self.deep_multiplier) for level in range(self.levels))
 
     @property
+    def inputs(self) -> int:
+        """Channels the first convolution sees."""
+        return 3 + CUES if self.shading_cues else 3
+
+    @property
     def multiple(self) -> int:
         """Image sides must be multiples of this."""
         return int(2**self.levels)
 
-    def as_dict(self) -> dict[str, int]:
-        """Return plain numbers for a checkpoint's header."""
+    def as_dict(self) -> dict[str, int | bool]:
+        """Return plain values for a checkpoint's header."""
         return asdict(self)
 
 
 PAPER_GENERATOR = GeneratorConfig()
-NARROW_GENERATOR = GeneratorConfig(width=16, levels=7, deep_multiplier=4)
+NARROW_GENERATOR = GeneratorConfig(
+    width=16, levels=7, deep_multiplier=4, shading_cues=True, detail_channels=16
+)
 """What is trained on two CPU cores and shipped: see docs/architecture.md for what differs and why."""
 
 
@@ -121,6 +142,31 @@ def upsampled_convolution(
     return functional.conv_transpose2d(x, kernel.transpose(0, 1), stride=2, padding=2, output_padding=1)
 
 
+class Detail(nn.Module):
+    """A correction of all maps at full resolution, from the decoders' last features and the network's input.
+
+    In the paper's network the finest skip reaches the maps linearly, at half resolution and through `width`
+    channels: enough for 64, not for 16, and cannot decide whether a bright pixel is paint, gloss or slope.
+    """
+
+    def __init__(self, config: GeneratorConfig) -> None:
+        """Build two 3x3 convolutions; the last begins at zero, and so does the correction."""
+        super().__init__()
+        features = sum(CHANNELS.values()) + len(CHANNELS) * DETAIL_FEATURES
+        self.conv1 = nn.Conv2d(features + config.inputs, config.detail_channels, 3, padding=1)
+        self.conv2 = nn.Conv2d(config.detail_channels, sum(CHANNELS.values()), 3, padding=1)
+        nn.init.zeros_(self.conv2.weight)
+        nn.init.zeros_(self.conv2.bias)  # type: ignore[arg-type]
+
+    def forward(
+        self, maps: Tensor, features: Tensor, seen: Float[Tensor, "b inputs h w"]
+    ) -> Float[Tensor, "b 10 h w"]:
+        """Return what to add to the maps before tanh."""
+        mixed = self.conv1(torch.cat([maps, features, seen], dim=1))
+        correction: Tensor = self.conv2(functional.leaky_relu(mixed, LEAKY_SLOPE))
+        return correction
+
+
 class Decoder(nn.Module):
     """One map's decoder: `levels` up-blocks fed by the level below and the encoder's skip."""
 
@@ -134,20 +180,21 @@ class Decoder(nn.Module):
             blocks.append(UpBlock(inputs, skip))
             norms.append(nn.InstanceNorm2d(skip, affine=True))
             inputs = 2 * skip
-        blocks.append(UpBlock(inputs, outputs))
+        blocks.append(UpBlock(inputs, outputs + (DETAIL_FEATURES if config.detail_channels else 0)))
         self.blocks = nn.ModuleList(blocks)
         self.norms = nn.ModuleList(norms)
         self.dropout = nn.Dropout(DROPOUT)
 
     def forward(self, features: list[Tensor]) -> Float[Tensor, "b outputs h w"]:
-        """Decode encoder features (finest first) to one map in [-1, 1]."""
+        """Decode encoder features (finest first) to one map before tanh, and features for `Detail`."""
         x = features[-1]
         for level, norm in enumerate(self.norms):
             x = norm(self.blocks[level](functional.leaky_relu(x, LEAKY_SLOPE)))
             if level < DROPOUT_LEVELS:
                 x = self.dropout(x)
             x = torch.cat([x, features[-2 - level]], dim=1)
-        return torch.tanh(self.blocks[-1](functional.leaky_relu(x, LEAKY_SLOPE)))
+        decoded: Tensor = self.blocks[-1](functional.leaky_relu(x, LEAKY_SLOPE))
+        return decoded
 
 
 class LightHead(nn.Module):
@@ -182,16 +229,21 @@ class Generator(nn.Module):
         widths = config.encoder_widths
         self.encoder = nn.ModuleList(
             nn.Conv2d(inputs, outputs, 4, stride=2, padding=1, bias=False)
-            for inputs, outputs in zip((3, *widths[:-1]), widths, strict=True)
+            for inputs, outputs in zip((config.inputs, *widths[:-1]), widths, strict=True)
         )
         # Neither the first nor the last level is normalised: they carry absolute levels.
         self.encoder_norms = nn.ModuleList(nn.InstanceNorm2d(width, affine=True) for width in widths[1:-1])
         self.decoders = nn.ModuleDict({name: Decoder(config, CHANNELS[name]) for name in MAPS})
         self.light_head = LightHead(widths[-1])
+        self.detail = Detail(config) if config.detail_channels else None
 
-    def encode(self, photo: Float[Tensor, "b 3 h w"]) -> list[Tensor]:
+    def see(self, photo: Float[Tensor, "b 3 h w"]) -> Float[Tensor, "b inputs h w"]:
+        """Return what the first convolution sees: the photo and, if so configured, its shading cues."""
+        return torch.cat([photo, shading_cues(photo)], dim=1) if self.config.shading_cues else photo
+
+    def encode(self, seen: Float[Tensor, "b inputs h w"]) -> list[Tensor]:
         """Return the features of every encoder level, finest first, before activation."""
-        features = [self.encoder[0](photo)]
+        features = [self.encoder[0](seen)]
         for level, conv in enumerate(self.encoder[1:]):
             x = conv(functional.leaky_relu(features[-1], LEAKY_SLOPE))
             features.append(self.encoder_norms[level](x) if level < len(self.encoder_norms) else x)
@@ -210,9 +262,14 @@ class Generator(nn.Module):
             raise ValueError(
                 f"photo has shape {tuple(photo.shape)}, its sides must be multiples of {multiple}"
             )
-        features = self.encode(photo)
-        maps = torch.cat([self.decoders[name](features) for name in MAPS], dim=1)
-        return maps, self.light_head(features[-1])
+        seen = self.see(photo)
+        features = self.encode(seen)
+        decoded = {name: self.decoders[name](features) for name in MAPS}
+        maps = torch.cat([decoded[name][:, : CHANNELS[name]] for name in MAPS], dim=1)
+        if self.detail is not None:
+            more = torch.cat([decoded[name][:, CHANNELS[name] :] for name in MAPS], dim=1)
+            maps = maps + self.detail(maps, more, seen)
+        return torch.tanh(maps), self.light_head(features[-1])
 
     @torch.no_grad()
     def predict(self, photo: Float[Tensor, "b 3 h w"]) -> tuple[SVBRDF, PointLight]:

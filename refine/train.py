@@ -98,6 +98,12 @@ def train(
     deep_multiplier: Annotated[
         int, typer.Option(help="Widest layer as a multiple of the width; 8 in the paper.")
     ] = NARROW_GENERATOR.deep_multiplier,
+    shading_cues: Annotated[
+        bool, typer.Option(help="Let the network see first-order shading cues; not in the paper.")
+    ] = NARROW_GENERATOR.shading_cues,
+    detail_channels: Annotated[
+        int, typer.Option(help="Of the full-resolution layers; 0 as in the paper.")
+    ] = NARROW_GENERATOR.detail_channels,
     learning_rate: Annotated[float, typer.Option(help="Adam's peak learning rate.")] = 8e-4,
     ema_decay: Annotated[float, typer.Option(help="Of the moving average that is written.")] = 0.999,
     seed: Annotated[int, typer.Option(help="Seed of weights, data and dropout.")] = 0,
@@ -116,7 +122,7 @@ def train(
         config = TrainerConfig(
             phases=parse_phases(phases), learning_rate=learning_rate, ema_decay=ema_decay, seed=seed
         )
-        architecture = GeneratorConfig(width, levels, deep_multiplier)
+        architecture = GeneratorConfig(width, levels, deep_multiplier, shading_cues, detail_channels)
         for phase in config.phases:
             if phase.crop % architecture.multiple:
                 raise ValueError(

@@ -138,6 +138,35 @@ def test_any_width_and_depth_runs(width: int, levels: int, multiplier: int, tile
     assert all(parameter.grad is not None for parameter in network.parameters())
 
 
+@pytest.mark.parametrize(("cues", "detail"), [(True, 0), (False, 6), (True, 6)])
+def test_cues_and_detail_are_seen_and_trained(cues: bool, detail: int) -> None:
+    config = GeneratorConfig(2, 4, 2, shading_cues=cues, detail_channels=detail)
+    network = Generator(config)
+    assert config.inputs == network.encoder[0].in_channels == (7 if cues else 3)
+    maps, light = network(photo(16, 32, batch=2) * 2 - 1)
+    assert maps.shape == (2, 10, 16, 32)
+    (maps.sum() + light.sum()).backward()
+    assert all(parameter.grad is not None for parameter in network.parameters())
+
+
+def test_detail_begins_as_no_correction_and_learns_from_the_input() -> None:
+    network = Generator(GeneratorConfig(2, 4, 2, detail_channels=6)).eval()
+    assert network.detail is not None
+    x = photo(16, 16) * 2 - 1
+    decoded = [network.decoders[name](network.encode(x))[:, : CHANNELS[name]] for name in MAPS]
+    assert_close(network(x)[0], torch.tanh(torch.cat(decoded, dim=1)))
+    torch.nn.init.normal_(network.detail.conv2.weight)
+    changed = x.clone()
+    changed[..., 8, 8] += 0.1  # one pixel reaches at most a 5x5 neighbourhood through the detail layers
+    features = torch.zeros(1, 8, 16, 16)
+    maps = torch.zeros(1, 10, 16, 16)
+    difference = (network.detail(maps, features, changed) - network.detail(maps, features, x)).detach()
+    assert float(difference[..., 8, 8].abs().max()) > 0.0
+    outside = torch.ones(16, 16, dtype=torch.bool)
+    outside[6:11, 6:11] = False
+    assert_close(difference[..., outside], torch.zeros(1, 10, int(outside.sum())), atol=1e-6)
+
+
 def test_eight_levels_shrink_256_pixels_to_one() -> None:
     network = Generator(GeneratorConfig(width=1, levels=8)).eval()
     features = network.encode(photo(256, 256))
@@ -152,8 +181,8 @@ def test_wrong_sides_are_named(tiny: Generator, size: tuple[int, int]) -> None:
         tiny.predict(photo(*size))
 
 
-@pytest.mark.parametrize("wrong", [(0, 8, 8), (64, 1, 8), (64, 11, 8), (64, 8, 0)])
-def test_impossible_shapes_are_refused(wrong: tuple[int, int, int]) -> None:
+@pytest.mark.parametrize("wrong", [(0, 8, 8), (64, 1, 8), (64, 11, 8), (64, 8, 0), (64, 8, 8, False, -1)])
+def test_impossible_shapes_are_refused(wrong: tuple[int, ...]) -> None:
     with pytest.raises(ValueError, match="not a generator"):
         GeneratorConfig(*wrong)
 
