@@ -23,6 +23,19 @@ MASK_NODES = 6
 """Random nodes per side that a smooth mixing mask is interpolated from."""
 
 
+METAL_LEVELS = (0.15, 0.95)
+"""Least and greatest mean F0 of a material turned into metal."""
+
+METAL_DIFFUSE = 0.15
+"""Most of its diffuse albedo that it keeps."""
+
+METAL_POLISH = 0.35
+"""Least factor of its roughness."""
+
+DARKEST_PATTERN = 0.02
+"""Albedo and F0 of a pattern are kept above this."""
+
+
 @dataclass(frozen=True)
 class Augmentation:
     """How much to vary; a value of zero (or False) switches its part off.
@@ -44,6 +57,8 @@ class Augmentation:
         specular: deviation of the logarithm of the factor of F0.
         specular_hue: deviation of the rotation of F0 colours about grey, radians; grey stays grey.
         relief: deviation of the logarithm of the factor of slopes.
+        metal: share of materials turned into metal: hardly any diffuse, its pattern as F0, smoother. Few
+            textures are of bare metal, and on it relief is all there is to see.
     """
 
     scale: tuple[float, float] = (0.55, 1.0)
@@ -61,6 +76,7 @@ class Augmentation:
     specular: float = 0.25
     specular_hue: float = 0.1
     relief: float = 0.3
+    metal: float = 0.0
 
     @staticmethod
     def none() -> Augmentation:
@@ -78,6 +94,7 @@ class Augmentation:
             specular=0.0,
             specular_hue=0.0,
             relief=0.0,
+            metal=0.0,
         )
 
 
@@ -131,7 +148,7 @@ def augment(
     """
     settings = settings or Augmentation()
     varied = view_tile(svbrdf, draw_pose(svbrdf.batch, generator, settings), size)
-    varied = jitter(varied, generator, settings)
+    varied = plate(jitter(varied, generator, settings), generator, settings)
     return mix(varied, generator, settings)
 
 
@@ -220,6 +237,34 @@ def jitter(svbrdf: SVBRDF, generator: torch.Generator, settings: Augmentation) -
         _recolour(svbrdf.diffuse, paint),
         (svbrdf.roughness**exponent).clamp(ROUGHNESS_FLOOR, 1.0),
         _recolour(svbrdf.specular, metal),
+    )
+
+
+def plate(svbrdf: SVBRDF, generator: torch.Generator, settings: Augmentation) -> SVBRDF:
+    """Turn some materials into metal: the diffuse pattern becomes one of F0, and the surface smoother.
+
+    Args:
+        svbrdf: materials of any size.
+        generator: source of randomness.
+        settings: `metal` is used; at 0 no random number is drawn.
+    """
+    if settings.metal == 0.0:
+        return svbrdf
+    uniform = torch.rand(svbrdf.batch, 6, generator=generator)[:, :, None, None, None]
+    chosen, level, contrast, tint, rest, polish = uniform.unbind(dim=1)
+    pattern = svbrdf.diffuse.clamp(min=DARKEST_PATTERN)
+    grey = pattern.mean(dim=1, keepdim=True)
+    pattern = torch.lerp(grey.expand_as(pattern), pattern, tint)
+    pattern = (pattern / grey.mean(dim=(2, 3), keepdim=True)) ** contrast
+    low, high = METAL_LEVELS
+    specular = ((low + (high - low) * level) * pattern).clamp(DARKEST_PATTERN, 1.0)
+    smoother = METAL_POLISH + (1.0 - METAL_POLISH) * polish
+    metal = chosen < settings.metal
+    return SVBRDF(
+        svbrdf.normal,
+        torch.where(metal, svbrdf.diffuse * METAL_DIFFUSE * rest, svbrdf.diffuse),
+        torch.where(metal, (svbrdf.roughness * smoother).clamp(min=ROUGHNESS_FLOOR), svbrdf.roughness),
+        torch.where(metal, specular, svbrdf.specular),
     )
 
 

@@ -6,10 +6,21 @@ import time
 import pytest
 import torch
 
-from nets.data.augment import Augmentation, Pose, augment, draw_pose, jitter, mix, view_tile
+from nets.data.augment import (
+    METAL_DIFFUSE,
+    Augmentation,
+    Pose,
+    augment,
+    draw_pose,
+    jitter,
+    mix,
+    plate,
+    view_tile,
+)
 from nets.data.images import unit_normal
 from nets.render import Camera, PointLight, render
 from nets.svbrdf import SVBRDF
+from tests.helpers import random_svbrdf, seeded
 
 ORTHOGRAPHIC = Camera("orthographic")
 QUARTERS = [0.0, 0.5 * math.pi, math.pi, 1.5 * math.pi]
@@ -191,3 +202,40 @@ def test_a_training_batch_takes_little_processor_time() -> None:
         augment(material, generator, size=128)
     # About 70 ms of one core; the bound is loose, for shared machines, and catches only other algorithms.
     assert (time.process_time() - started) / 3 < 0.5
+
+
+# Metal
+
+
+def test_metal_keeps_relief_and_turns_the_pattern_into_reflectance() -> None:
+    svbrdf = random_svbrdf(64, 6, 6, seed=2)
+    plated = plate(svbrdf, seeded(0), Augmentation(metal=1.0))
+    plated.validate()
+    assert torch.equal(plated.normal, svbrdf.normal)
+    assert bool((plated.diffuse <= METAL_DIFFUSE * svbrdf.diffuse + 1e-7).all())
+    assert bool((plated.roughness <= svbrdf.roughness + 1e-7).all())
+    grey, pattern = plated.specular.mean(dim=1), svbrdf.diffuse.mean(dim=1)
+    correlation = [
+        float(torch.corrcoef(torch.stack([a.flatten(), b.flatten()]))[0, 1])
+        for a, b in zip(grey, pattern, strict=True)
+    ]
+    assert sum(correlation) / len(correlation) > 0.5
+    levels = plated.specular.mean(dim=(1, 2, 3))
+    assert float(levels.min()) < 0.35
+    assert float(levels.max()) > 0.6
+
+
+def test_about_the_asked_share_becomes_metal_and_the_rest_stays() -> None:
+    svbrdf = random_svbrdf(400, 2, 2, seed=3)
+    plated = plate(svbrdf, seeded(1), Augmentation(metal=0.25))
+    changed = (plated.specular != svbrdf.specular).flatten(1).any(dim=1)
+    assert 0.18 < float(changed.float().mean()) < 0.32
+    for before, after in zip(svbrdf.channels()[~changed], plated.channels()[~changed], strict=True):
+        assert torch.equal(before, after)
+
+
+def test_without_metal_no_random_number_is_drawn() -> None:
+    svbrdf, generator = random_svbrdf(2, 4, 4), seeded(5)
+    state = generator.get_state()
+    assert plate(svbrdf, generator, Augmentation()) is svbrdf
+    assert torch.equal(generator.get_state(), state)
