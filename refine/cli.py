@@ -7,6 +7,7 @@ mistakes answer at once. Every mistake a user can make ends in one sentence on s
 from __future__ import annotations
 
 import json
+import logging
 import math
 import sys
 from collections.abc import Callable, Iterator, Sequence
@@ -83,6 +84,7 @@ def fit(
         bool,
         _switch("--quick", help=f"--iters {QUICK_ITERATIONS} --no-report", panel="Refinement"),
     ] = False,
+    engine: Annotated[str, _refinement("NAME", "(auto), fused, reference")] = "auto",
     seed: Annotated[int, _refinement("N", "Same seed, same bytes (0)")] = 0,
     out: Annotated[Path | None, _output("DIR", "Folder (./<photo>_material)")] = None,
     format: Annotated[str, _output("NAME", "(png), png8, tif, tif8, tif32, exr, exr32")] = "png",
@@ -121,6 +123,7 @@ def fit(
     import torch
 
     from nets.render import Camera, PointLight
+    from refine.engine import ENGINES
     from refine.photo import ColorSpaceChoice, read_photo
     from refine.refiner import Refiner
     from refine.result import MAP_FORMATS, Output, describe, describe_checkpoint, write_result
@@ -129,7 +132,10 @@ def fit(
     _choose("--color-space", color_space, get_args(ColorSpaceChoice))
     _choose("--recipe", recipe, tuple(RECIPES))
     _choose("--format", format, tuple(MAP_FORMATS))
+    _choose("--engine", engine, ("auto", *ENGINES))
     _require_device(device)
+    if engine == "fused" and torch.device(device).type != "cpu":
+        raise UserError(f"--engine fused runs on CPUs, not on {device}; leave --engine or --device out.")
     if threads is not None:
         torch.set_num_threads(threads)
     read = read_photo(photo, color_space=cast(ColorSpaceChoice, color_space))
@@ -143,7 +149,17 @@ def fit(
     output.require_writable(photo)
     checkpoint = describe_checkpoint(init)
     seen_from = Camera(kind) if viewpoint is None else Camera(kind, viewpoint)
-    refiner = Refiner(init, recipe, camera=seen_from, resolution=resolution or None, seed=seed, device=device)
+    refiner = Refiner(
+        init,
+        recipe,
+        camera=seen_from,
+        resolution=resolution or None,
+        seed=seed,
+        device=device,
+        engine=None if engine == "auto" else engine,
+    )
+    if quiet:  # engines announce in the log what takes long
+        logging.getLogger("refine").setLevel(logging.ERROR)
     flash: PointLight | None = None
     if position is not None:
         flash = PointLight.at(position, falloff=cast(Literal["none", "inverse_square"], falloff)).to(device)
@@ -154,6 +170,7 @@ def fit(
         "init": init,
         "recipe": recipe,
         "iters": iters,
+        "engine": engine,
         "resolution": resolution,
         "light": light,
         "falloff": falloff,

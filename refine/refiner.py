@@ -18,7 +18,7 @@ from nets.ensemble import FlipAverage
 from nets.render import Camera, PointLight, render, shade, shading_geometry, surface_points
 from nets.svbrdf import SVBRDF
 from refine.capture import Capture
-from refine.engine.reference import descend
+from refine.engine import choose_engine, find_descend
 from refine.initialization import Predict, Predictor, initialize
 from refine.light import fit_light
 from refine.maps import MapFormat, NormalConvention, write_maps
@@ -50,6 +50,8 @@ class Refined:
         recipe: what was done.
         notes: everything done to the photo, in plain words.
         source: file name of the photo, or `array`.
+        settings: what else is worth knowing of how it was made.
+        engine: that ran the stages, see `refine.engine`.
     """
 
     svbrdf: SVBRDF
@@ -63,6 +65,7 @@ class Refined:
     notes: tuple[str, ...] = ()
     source: str = "array"
     settings: dict[str, Any] = field(default_factory=dict)
+    engine: str = "reference"
 
     @torch.no_grad()
     def render(self, light: PointLight | None = None, camera: Camera | None = None) -> Tensor:
@@ -106,6 +109,7 @@ class Refiner:
         flips: bool = True,
         seed: int = 0,
         device: str | torch.device = "cpu",
+        engine: str | None = None,
     ) -> None:
         """Set up.
 
@@ -118,12 +122,14 @@ class Refiner:
             flips: average a named checkpoint's guess over four mirrored photos (`nets.ensemble`).
             seed: of everything random, for models or recipes that draw numbers.
             device: where to compute.
+            engine: a name in `refine.engine.ENGINES`; None takes the fastest for the device.
 
         Raises:
             nets.checkpoint.CheckpointError: if a named checkpoint cannot be loaded.
-            ValueError: for an unknown recipe.
+            ValueError: for an unknown recipe, or an engine that is not there for the device.
         """
         self.device = torch.device(device)
+        self.engine = choose_engine(engine, self.device.type)
         if isinstance(model, str | Path):
             network = load_model(model)
             network.to(self.device)
@@ -178,7 +184,7 @@ class Refiner:
             light = fit_light(initial, guess, capture, recipe.light_fit).to(self.device)
             seconds["light"] = time.perf_counter() - clock
         light = light or guess
-        svbrdf, losses = run_stages(initial, light, capture, recipe, seconds, progress)
+        svbrdf, losses = run_stages(initial, light, capture, recipe, seconds, progress, self.engine)
         return Refined(
             svbrdf.detach(),
             initial,
@@ -190,6 +196,7 @@ class Refiner:
             recipe,
             photo.notes,
             photo.source,
+            engine=self.engine,
         )
 
 
@@ -200,8 +207,9 @@ def run_stages(
     recipe: Recipe,
     seconds: dict[str, float],
     progress: Report | None = None,
+    engine: str | None = None,
 ) -> tuple[SVBRDF, dict[str, list[float]]]:
-    """Run a recipe's stages from an initialization under a fixed light.
+    """Run a recipe's stages from an initialization under a fixed light, by an engine of `refine.engine`.
 
     Returns:
         The material (the initialization itself, untouched, if the recipe has no iterations) and the losses
@@ -216,6 +224,7 @@ def run_stages(
     losses = {"initialization": [float(start)]}
     if recipe.iterations == 0:
         return initial, losses
+    descend = find_descend(choose_engine(engine, capture.photo.device.type))
     parameters = Parameters.from_svbrdf(initial)
     finished = 0
     for stage in recipe.stages:

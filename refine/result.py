@@ -165,6 +165,7 @@ def describe(
         },
         "settings": {**settings, **refined.settings},
         "recipe": refined.recipe.as_dict(),
+        "engine": refined.engine,
         "checkpoint": checkpoint,
         "light": {"position": position, "intensity": intensity, "falloff": refined.light.falloff},
         "camera": asdict(refined.camera),

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import torch
+from jaxtyping import Bool
 from torch import Tensor
 
 from losses.refinement import photo_distance
-from nets.render import Geometry, shade
+from nets.render import PAPER, Conventions, Geometry, shade
 from refine.capture import Capture
 from refine.parametrization import Parameters
 
@@ -30,11 +31,12 @@ Progress = Callable[[int, float], None]
 def descend(
     start: Parameters,
     offsets: dict[str, Tensor],
-    capture: Capture,
-    geometry: Geometry,
+    capture: Capture | Sequence[Capture],
+    geometry: Geometry | Sequence[Geometry],
     *,
     iterations: int,
     rates: dict[str, float],
+    conventions: Conventions = PAPER,
     progress: Progress | None = None,
 ) -> tuple[Parameters, list[float]]:
     """Minimise the photo's distance over additive offsets to some maps' parameters.
@@ -43,15 +45,17 @@ def descend(
         start: where every pixel begins.
         offsets: zero tensors to optimise, by map name. Full-size ones move every pixel by its own
             gradient; `[1, C, 1, 1]` ones move all pixels by the gradient averaged over all of them.
-        capture: the photo to explain.
-        geometry: of the light and camera, fixed.
+        capture: the photo to explain, or several of the same surface, whose distances add.
+        geometry: of the light and camera of each photo, fixed.
         iterations: Adam steps.
         rates: Adam's learning rate by map name, decayed along a quarter cosine to `FINAL_RATE` of it.
+        conventions: of the renderer.
         progress: told of every iteration.
 
     Returns:
         The parameters with the lowest loss seen, and the loss before every step and after the last.
     """
+    captures, geometries = several(capture, geometry)
     moving = {name: offset.detach().clone().requires_grad_(True) for name, offset in offsets.items()}
     # The gradient of a pixel's own distance, or its average over all pixels where they share one offset.
     own_pixels = max(offset.shape[-2] * offset.shape[-1] for offset in offsets.values())
@@ -63,17 +67,20 @@ def descend(
     )
 
     # A clipped pixel cannot say which of its maps is wrong: of itself it keeps what it had. It still counts
-    # where all pixels move together.
-    own = {name: offset.shape[-2:] == capture.photo.shape[-2:] for name, offset in offsets.items()}
+    # where all pixels move together. Of several photos it takes one in which it is not clipped.
+    own = {name: offset.shape[-2:] == start.normal.shape[-2:] for name, offset in offsets.items()}
+    moves = unsaturated_somewhere(captures)
 
     def moved(values: dict[str, Tensor]) -> Parameters:
-        return start.shifted(
-            {name: value * capture.unsaturated if own[name] else value for name, value in values.items()}
-        )
+        return start.shifted({name: value * moves if own[name] else value for name, value in values.items()})
 
     def distance() -> Tensor:
-        rendering = shade(moved(moving).svbrdf(), geometry)
-        return photo_distance(rendering, capture.photo, capture.unsaturated)
+        material = moved(moving).svbrdf()
+        distances = [
+            photo_distance(shade(material, geometry, conventions), capture.photo, capture.unsaturated)
+            for capture, geometry in zip(captures, geometries, strict=True)
+        ]
+        return torch.stack(distances).sum()
 
     history: list[float] = []
     best, best_loss = {name: value.detach().clone() for name, value in moving.items()}, float("inf")
@@ -97,3 +104,23 @@ def descend(
     with torch.no_grad():
         keep(float(distance()))
     return moved(best), history
+
+
+def several(
+    capture: Capture | Sequence[Capture], geometry: Geometry | Sequence[Geometry]
+) -> tuple[list[Capture], list[Geometry]]:
+    """Return photos and their geometries as lists of one length, of which each may be given alone.
+
+    Raises:
+        ValueError: if there are not as many geometries as photos, or none.
+    """
+    captures = [capture] if isinstance(capture, Capture) else list(capture)
+    geometries = [geometry] if isinstance(geometry, Geometry) else list(geometry)
+    if not captures or len(captures) != len(geometries):
+        raise ValueError(f"{len(captures)} photos and {len(geometries)} geometries do not make pairs")
+    return captures, geometries
+
+
+def unsaturated_somewhere(captures: Sequence[Capture]) -> Bool[Tensor, "1 1 h w"]:
+    """Return where at least one photo is not clipped."""
+    return torch.stack([capture.unsaturated for capture in captures]).any(dim=0)

@@ -1,0 +1,274 @@
+"""The fused engine: what `reference.py` computes, in one pass over the pixels, on all cores of a CPU.
+
+Pixels that move by their own gradient do not depend on each other, so each block of them runs through *all*
+iterations while it stays in the first level of cache (`kernel.py`); nothing but parameters and loss sums ever
+reaches memory. Offsets that all pixels share need one pass and one small sum per iteration.
+
+The results do not depend on the number of threads: blocks are fixed, and their sums are added in their order.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from nets.render import PAPER, Conventions, Geometry
+from nets.svbrdf import MAPS
+from refine.capture import Capture
+from refine.engine import kernel, layout
+from refine.engine.compilation import prepare
+from refine.engine.reference import (
+    ADAM_BETAS,
+    ADAM_EPSILON,
+    FINAL_RATE,
+    Progress,
+    several,
+    unsaturated_somewhere,
+)
+from refine.engine.workers import Workers
+from refine.parametrization import Parameters
+
+SPAN_BLOCKS = 1024
+"""Blocks that are packed, run and unpacked together: 65,536 pixels, some 15 MB in float32."""
+
+
+def descend(
+    start: Parameters,
+    offsets: dict[str, Tensor],
+    capture: Capture | Sequence[Capture],
+    geometry: Geometry | Sequence[Geometry],
+    *,
+    iterations: int,
+    rates: dict[str, float],
+    conventions: Conventions = PAPER,
+    progress: Progress | None = None,
+) -> tuple[Parameters, list[float]]:
+    """Minimise the photo's distance as `refine.engine.reference.descend` does, which see.
+
+    Unlike there, offsets are either all full-size or all `[1, C, 1, 1]`, and `progress` is told in bursts: of
+    photos of more than one span, with losses over the pixels that are finished.
+
+    Raises:
+        ValueError: for tensors off the CPU or of another type than float32 and float64, or mixed offsets.
+    """
+    problem = _problem(start, capture, geometry, conventions)
+    own = {offset.shape[-2:] == start.normal.shape[-2:] for offset in offsets.values()}
+    if len(own) != 1:
+        raise ValueError("offsets must be all per pixel or all shared by the pixels")
+    steps = _steps(iterations, rates)
+    run = _descend_pixels if own.pop() else _descend_together
+    with Workers.of_torch() as workers:
+        found, history = run(problem, offsets, steps, workers, progress)
+    return start.shifted(found), history
+
+
+def distance_and_gradients(
+    start: Parameters,
+    capture: Capture | Sequence[Capture],
+    geometry: Geometry | Sequence[Geometry],
+    conventions: Conventions = PAPER,
+) -> tuple[float, dict[str, Float[Tensor, "1 c h w"]]]:
+    """Return the distance, and by map name the gradient of every pixel's own distance by its parameters.
+
+    It is one step of the descent, of rate -1 and without memory, with which clipped pixels move, too: there
+    is no second implementation that could differ.
+    """
+    problem = _problem(start, capture, geometry, conventions)
+    problem = replace(problem, moves=torch.ones_like(problem.moves))
+    zeros = {name: torch.zeros_like(getattr(start, name)) for name in MAPS}
+    # offset -= rate first / (sqrt(second) correction + epsilon), with first = gradient
+    steps = np.array([[-1.0] * kernel.PARAMETERS + [0.0, 1.0]])
+    with Workers.of_torch() as workers:
+        gradients, history = _run_pixels(problem, zeros, steps, (0.0, 0.0), workers, None)
+    return history[0], gradients
+
+
+@dataclass(frozen=True)
+class _Problem:
+    """What is fixed during a descent."""
+
+    start: Parameters
+    captures: list[Capture]
+    geometries: list[Geometry]
+    moves: Bool[Tensor, "1 1 h w"]
+    constants: Float[np.ndarray, "constants"]
+
+    @property
+    def real(self) -> np.dtype:
+        return self.constants.dtype
+
+    @property
+    def pixels(self) -> int:
+        return self.moves.numel()
+
+    def spans(self, blocks: int = SPAN_BLOCKS) -> list[slice]:
+        size = blocks * kernel.BLOCK
+        return [slice(first, min(first + size, self.pixels)) for first in range(0, self.pixels, size)]
+
+    def pack(self, offsets: dict[str, Tensor], span: slice) -> _Packed:
+        return _Packed(
+            layout.pack_surface(self.start, offsets, self.moves, span),
+            layout.pack_photos(self.captures, self.geometries, span, self.start.normal.dtype),
+            layout.count_pixels(span),
+        )
+
+
+@dataclass(frozen=True)
+class _Packed:
+    """A span of pixels as the compiled loops read it."""
+
+    surface: Float[np.ndarray, "blocks surface"]
+    photos: Float[np.ndarray, "blocks photos"]
+    counts: Int[np.ndarray, "blocks"]
+
+
+def _problem(
+    start: Parameters,
+    capture: Capture | Sequence[Capture],
+    geometry: Geometry | Sequence[Geometry],
+    conventions: Conventions,
+) -> _Problem:
+    captures, geometries = several(capture, geometry)
+    dtype, device = start.normal.dtype, start.normal.device
+    if device.type != "cpu" or dtype not in (torch.float32, torch.float64):
+        raise ValueError(f"the fused engine takes float32 or float64 on the CPU, not {dtype} on {device}")
+    prepare(dtype)
+    constants = layout.constants(conventions, dtype)
+    return _Problem(start, captures, geometries, unsaturated_somewhere(captures), constants)
+
+
+def _steps(iterations: int, rates: dict[str, float]) -> Float[np.ndarray, "iterations numbers"]:
+    # Bias-corrected rates, correction of the second moment, epsilon: all of Adam that changes with time.
+    number = np.arange(iterations)[:, None]
+    schedule = FINAL_RATE + (1.0 - FINAL_RATE) * np.cos(math.pi / 2 * number / max(1, iterations))
+    steps = np.zeros((iterations, kernel.PARAMETERS + 2))
+    for name, rate in rates.items():
+        steps[:, layout.ROWS[name]] = rate * schedule / (1.0 - ADAM_BETAS[0] ** (number + 1))
+    steps[:, kernel.PARAMETERS] = 1.0 / np.sqrt(1.0 - ADAM_BETAS[1] ** (number[:, 0] + 1))
+    steps[:, kernel.PARAMETERS + 1] = ADAM_EPSILON
+    return steps
+
+
+def _best(history: list[float]) -> int:
+    # The first of the lowest; the start if there is none, as the reference has it.
+    return int(np.argmin(np.nan_to_num(np.array(history), nan=np.inf)))
+
+
+def _descend_pixels(
+    problem: _Problem,
+    offsets: dict[str, Tensor],
+    steps: Float[np.ndarray, "iterations numbers"],
+    workers: Workers,
+    progress: Progress | None,
+) -> tuple[dict[str, Tensor], list[float]]:
+    steps = steps.copy()
+    still = [name for name in MAPS if name not in offsets]
+    for name in still:
+        steps[:, layout.ROWS[name]] = 0.0
+    found, history = _run_pixels(problem, offsets, steps, ADAM_BETAS, workers, progress)
+    if (best := _best(history)) < len(steps):
+        # Pixels do not know of each other, so only now is it known when to stop: go there again.
+        found, _ = _run_pixels(problem, offsets, steps[:best], ADAM_BETAS, workers, None)
+    return found, history
+
+
+def _run_pixels(
+    problem: _Problem,
+    offsets: dict[str, Tensor],
+    steps: Float[np.ndarray, "iterations numbers"],
+    betas: tuple[float, float],
+    workers: Workers,
+    progress: Progress | None,
+) -> tuple[dict[str, Tensor], list[float]]:
+    real, count = problem.real, len(steps)
+    steps_, betas_ = steps.astype(real), np.array([1.0 - betas[0], betas[1], 1.0 - betas[1]], dtype=real)
+    shared = np.zeros(kernel.PARAMETERS, dtype=real)
+    found = {name: torch.empty_like(offset) for name, offset in offsets.items()}
+    total, finished, told = np.zeros(count + 1), 0, 0
+    for span in problem.spans():
+        packed = problem.pack(offsets, span)
+        losses = np.empty((len(packed.counts), count + 1))
+
+        def work(part: slice, packed: _Packed = packed, losses: np.ndarray = losses) -> None:
+            kernel.descend_blocks(
+                packed.surface[part],
+                packed.photos[part],
+                shared,
+                problem.constants,
+                betas_,
+                steps_,
+                layout.scratch(real),
+                packed.counts[part],
+                losses[part],
+            )
+
+        workers.run(work, len(packed.counts))
+        layout.unpack_offsets(packed.surface, span, found)
+        total += losses.sum(axis=0)
+        finished = span.stop
+        mark = count * finished // problem.pixels
+        for iteration in range(told, mark if progress is not None else told):
+            assert progress is not None
+            progress(iteration + 1, float(total[iteration]) / (3 * finished))
+        told = mark
+    return found, [float(loss) / (3 * problem.pixels) for loss in total]
+
+
+def _descend_together(
+    problem: _Problem,
+    offsets: dict[str, Tensor],
+    steps: Float[np.ndarray, "iterations numbers"],
+    workers: Workers,
+    progress: Progress | None,
+) -> tuple[dict[str, Tensor], list[float]]:
+    real = problem.real
+    packed = problem.pack({}, slice(0, problem.pixels))
+    sums = np.empty((len(packed.counts), kernel.PARAMETERS + 1))
+    shared = np.zeros(kernel.PARAMETERS)
+    moving = np.zeros(kernel.PARAMETERS, dtype=bool)
+    for name, offset in offsets.items():
+        shared[layout.ROWS[name]] = offset.detach().reshape(-1).numpy()
+        moving[layout.ROWS[name]] = True
+    first, second = np.zeros_like(shared), np.zeros_like(shared)
+    history: list[float] = []
+    best = shared.copy()
+
+    def evaluate() -> Float[np.ndarray, "9"]:
+        now = shared.astype(real)
+
+        def work(part: slice) -> None:
+            kernel.sum_blocks(
+                packed.surface[part],
+                packed.photos[part],
+                now,
+                problem.constants,
+                layout.scratch(real),
+                packed.counts[part],
+                sums[part],
+            )
+
+        workers.run(work, len(packed.counts))
+        total = sums.sum(axis=0)
+        history.append(float(total[-1]) / (3 * problem.pixels))
+        if _best(history) == len(history) - 1:
+            best[:] = shared
+        return np.asarray(total[:-1] / problem.pixels)
+
+    for iteration, step in enumerate(steps):
+        gradient = np.where(moving, evaluate(), 0.0)
+        first += (gradient - first) * (1.0 - ADAM_BETAS[0])
+        second += (gradient**2 - second) * (1.0 - ADAM_BETAS[1])
+        shared -= step[:-2] * first / (np.sqrt(second) * step[-2] + step[-1])
+        if progress is not None:
+            progress(iteration + 1, history[-1])
+    evaluate()
+    found = {}
+    for name, offset in offsets.items():
+        found[name] = torch.from_numpy(best[layout.ROWS[name]]).to(offset.dtype).reshape(offset.shape)
+    return found, history

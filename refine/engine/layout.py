@@ -1,0 +1,147 @@
+"""How the fused engine packs tensors for its compiled loops (`kernel.py`): blocks of pixels, rows of numbers.
+
+Only a span of pixels is packed at a time, so that what is packed stays small however large the photo is.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from losses.reflectance import LOG_OFFSET
+from nets.render import Conventions, Geometry
+from nets.svbrdf import MAPS
+from refine.capture import Capture
+from refine.engine import kernel
+from refine.parametrization import ALBEDO_RANGE, ROUGHNESS_RANGE, SLOPE_SCALE, Parameters
+
+ROWS: dict[str, slice] = dict(zip(MAPS, (slice(0, 2), slice(2, 5), slice(5, 6), slice(6, 9)), strict=True))
+"""Where each map's parameters are among the numbers of a pixel."""
+
+OUT_OF_REACH = 1e30
+"""Ceiling of renderings where the photo is not clipped; above any radiance there is, below float32's end."""
+
+Span = slice
+"""A range of pixels in row order; it begins at a multiple of `kernel.BLOCK`."""
+
+
+def constants(conventions: Conventions, dtype: torch.dtype) -> Float[np.ndarray, "9"]:
+    """Return what the compiled loops must know of parametrization, data term and renderer, in their order."""
+    (albedo, white), (smooth, rough) = ALBEDO_RANGE, ROUGHNESS_RANGE
+    return np.array(
+        [
+            SLOPE_SCALE,
+            albedo,
+            white - albedo,
+            smooth,
+            rough - smooth,
+            LOG_OFFSET,
+            conventions.roughness_floor,
+            conventions.visibility_floor,
+            conventions.distribution_floor,
+        ],
+        dtype=numpy_type(dtype),
+    )
+
+
+def numpy_type(dtype: torch.dtype) -> np.dtype:
+    """Return numpy's name of a type."""
+    return np.dtype(str(dtype).removeprefix("torch."))
+
+
+def count_pixels(span: Span) -> Int[np.ndarray, "blocks"]:
+    """Return how many pixels of each block are no padding."""
+    starts = np.arange(span.start, span.stop, kernel.BLOCK, dtype=np.int64)
+    return np.minimum(kernel.BLOCK, span.stop - starts)
+
+
+def scratch(real: np.dtype) -> Float[np.ndarray, "numbers"]:
+    """Return what one thread needs besides the blocks it works on."""
+    return np.empty(kernel.SCRATCH_ROWS * kernel.BLOCK, dtype=real)
+
+
+def pack_surface(
+    start: Parameters, offsets: dict[str, Tensor], moves: Bool[Tensor, "1 1 h w"], span: Span
+) -> Float[np.ndarray, "blocks numbers"]:
+    """Pack starting parameters, whether pixels move, and offsets, `[1, C, H, W]` by map name.
+
+    Args:
+        start: parameters at the start.
+        offsets: full-size offsets; maps that are not named have none.
+        moves: where offsets count and are moved.
+        span: the pixels.
+    """
+    blocks = _blocks(kernel.SURFACE_ROWS, span, start.normal.dtype)
+    for name in MAPS:
+        rows = ROWS[name]
+        _fill(blocks, kernel.START + rows.start, getattr(start, name), span)
+        if name in offsets:
+            _fill(blocks, kernel.OFFSET + rows.start, offsets[name], span)
+    _fill(blocks, kernel.MOVES, moves, span)
+    blocks[:, kernel.OFFSET :] *= blocks[:, kernel.MOVES, None]
+    return blocks.reshape(len(blocks), -1)
+
+
+def pack_photos(
+    captures: Sequence[Capture], geometries: Sequence[Geometry], span: Span, dtype: torch.dtype
+) -> Float[np.ndarray, "blocks numbers"]:
+    """Pack photos with the geometry of their lights and cameras, side by side within each block."""
+    packed = np.concatenate(
+        [
+            _pack_photo(capture, geometry, span, dtype)
+            for capture, geometry in zip(captures, geometries, strict=True)
+        ],
+        axis=1,
+    )
+    return packed.reshape(len(packed), -1)
+
+
+def unpack_offsets(surface: Float[np.ndarray, "blocks numbers"], span: Span, into: dict[str, Tensor]) -> None:
+    """Write the offsets of a span of pixels into full-size tensors `[1, C, H, W]`, by map name."""
+    blocks = surface.reshape(len(surface), -1, kernel.BLOCK)[:, kernel.OFFSET :]
+    size = span.stop - span.start
+    for name, tensor in into.items():
+        pixels = blocks[:, ROWS[name]].transpose(1, 0, 2).reshape(tensor.shape[1], -1)[:, :size]
+        tensor.view(tensor.shape[1], -1)[:, span] = torch.from_numpy(pixels)
+
+
+def _pack_photo(
+    capture: Capture, geometry: Geometry, span: Span, dtype: torch.dtype
+) -> Float[np.ndarray, "blocks rows block"]:
+    blocks = _blocks(kernel.PHOTO_ROWS, span, dtype)
+    _fill(blocks, kernel.LIGHT, geometry.light_direction, span)
+    _fill(blocks, kernel.VIEW, geometry.view, span)
+    _fill(blocks, kernel.HALF, geometry.half_vector, span)
+    _fill(blocks, kernel.FRESNEL, geometry.fresnel_weight, span)
+    _fill(blocks, kernel.IRRADIANCE, geometry.irradiance, span)
+    _fill(blocks, kernel.TARGET, capture.photo, span)
+    blocks[:, kernel.TARGET : kernel.CEILING] += blocks.dtype.type(LOG_OFFSET)
+    _fill(blocks, kernel.CEILING, capture.unsaturated, span)
+    ceiling = blocks[:, kernel.CEILING]
+    ceiling[:] = np.where(ceiling > 0.0, OUT_OF_REACH, 1.0)
+    return blocks
+
+
+def _blocks(rows: int, span: Span, dtype: torch.dtype) -> Float[np.ndarray, "blocks rows block"]:
+    count = -(-(span.stop - span.start) // kernel.BLOCK)
+    return np.zeros((count, rows, kernel.BLOCK), dtype=numpy_type(dtype))
+
+
+def _fill(blocks: Float[np.ndarray, "blocks rows block"], row: int, tensor: Tensor, span: Span) -> None:
+    # A map `[1, C, H, W]`, or one value per channel `[1, C, 1, 1]`, to the rows from `row` on.
+    channels, size = tensor.shape[1], span.stop - span.start
+    rows = blocks[:, row : row + channels]
+    flat = tensor.detach().reshape(channels, -1)
+    if flat.shape[1] == 1:
+        rows[:] = flat.numpy()
+        return
+    pixels = flat[:, span].numpy()
+    whole = size // kernel.BLOCK * kernel.BLOCK
+    full = pixels[:, :whole].reshape(channels, -1, kernel.BLOCK)
+    rows[: len(rows) if whole == size else -1] = full.transpose(1, 0, 2)
+    if whole < size:
+        rows[-1, :, : size - whole] = pixels[:, whole:]
