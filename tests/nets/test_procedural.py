@@ -3,12 +3,22 @@
 from __future__ import annotations
 
 import functools
+from collections.abc import Callable
 
 import numpy as np
 import pytest
 
 from nets.data import procedural
-from nets.data.procedural import FAMILIES, HELD_OUT_FAMILIES, MaterialMaps, generate, random_material
+from nets.data.procedural import (
+    FAMILIES,
+    HELD_OUT_FAMILIES,
+    MaterialMaps,
+    generate,
+    random_material,
+    relief,
+)
+from nets.data.procedural.compose import cavity
+from nets.data.procedural.noise import grid
 
 SIZE = 96
 SEEDS = (0, 1, 2, 3)
@@ -100,7 +110,10 @@ def test_there_is_detail_at_the_finest_scale(family: str) -> None:
         assert (np.abs(np.diff(array, axis=1)) > 1e-5).mean() > 0.5
 
 
-@pytest.mark.parametrize("family", ["brick", "woven_fabric", "diamond_plate", "parquet"])
+@pytest.mark.parametrize(
+    "family",
+    ["brick", "diamond_plate", "parquet", "woven_fabric", "riveted_panel", "setts", "quilted_leather"],
+)
 @pytest.mark.parametrize("size", [16, 65, 256])
 def test_any_size(family: str, size: int) -> None:
     assert generate(family, size, 5).diffuse.shape == (size, size, 3)
@@ -110,6 +123,72 @@ def test_bricks_stand_above_their_mortar_and_mortar_is_rougher() -> None:
     maps = material("brick")
     low, high = np.quantile(maps.height, [0.1, 0.6])
     assert maps.roughness[maps.height < low].mean() > maps.roughness[maps.height > high].mean() + 0.05
+
+
+RELIEFS = {
+    "sheet": (
+        "tread_plate",
+        "stamped_sheet",
+        "knurled_metal",
+        "wire_mesh",
+        "corrugated_sheet",
+        "pressed_tin",
+    ),
+    "stones": ("setts", "rounded_cobbles", "pillowed_tile"),
+    "padding": ("tufted_leather", "quilted_leather"),
+    "panels": ("riveted_panel",),
+}
+each_relief = pytest.mark.parametrize("family", [name for group in RELIEFS.values() for name in group])
+
+
+@each_relief
+def test_reliefs_have_steep_edges_and_no_cliffs(family: str) -> None:
+    """Bevels of tens of degrees are what a flash shows; hardly a pixel stands steeper than 75."""
+    tilts = [
+        np.degrees(np.arccos(np.minimum(generate(family, 192, seed).normal[..., 2], 1))) for seed in SEEDS
+    ]
+    steep = [float(np.quantile(tilt, 0.99)) for tilt in tilts]
+    assert min(steep) > 10
+    assert 25 < max(steep) < 75
+
+
+@pytest.mark.parametrize("family", [*RELIEFS["stones"], *RELIEFS["padding"]])
+def test_stones_and_padding_are_rougher_and_mostly_darker_where_they_are_deep(family: str) -> None:
+    lightness, roughness = [], []
+    for seed in SEEDS:
+        maps = generate(family, 128, seed)
+        deep = cavity(maps.height, 0.1) > 1
+        lightness.append(np.log(maps.diffuse[deep].mean() / maps.diffuse[~deep].mean()))
+        roughness.append(maps.roughness[deep].mean() - maps.roughness[~deep].mean())
+    if family != "pillowed_tile":  # grout is often paler than tiles
+        assert np.median(lightness) < -0.03
+    assert np.median(roughness) > 0.01
+
+
+def test_shoulders_rise_at_the_angle_asked_for_and_level_off() -> None:
+    distance = np.linspace(-0.1, 0.3, 4001)
+    for power in (1.0, 2.0, 3.0):
+        height = relief.shoulder(distance, 0.2, 50, power)
+        climb = np.degrees(np.arctan(np.gradient(height.astype(np.float64), distance[1] - distance[0])))
+        assert climb.max() == pytest.approx(50, abs=0.5)
+        assert height.min() == 0
+        assert height[-1] == pytest.approx(0.2 * np.tan(np.radians(50)) / power, rel=1e-5)
+    swelling = relief.swell(distance, 0.2, 50).astype(np.float64)
+    middle = np.degrees(np.arctan(np.gradient(swelling, distance[1] - distance[0]))).max()
+    assert middle == pytest.approx(50, abs=0.5)
+
+
+@pytest.mark.parametrize("places", [relief.hexagons, relief.scales])
+def test_distances_to_the_borders_of_hexagons_and_scales_are_distances(
+    places: Callable[..., tuple[relief.Lattice, np.ndarray]],
+) -> None:
+    """Never negative, zero somewhere on each border, and nowhere steeper than 1."""
+    x, y = grid(256)
+    lattice, edge = places(x, y, 0.5)
+    assert edge.min() > -1e-5
+    border = lattice.index[:, 1:] != lattice.index[:, :-1]
+    assert np.minimum(edge[:, 1:], edge[:, :-1])[border].max() < 2 / 256 + 1e-5
+    assert np.abs(np.diff(edge, axis=1)).max() < 2 / 256 + 1e-5
 
 
 @pytest.mark.parametrize("family", ["brushed_metal", "scratched_metal", "galvanized"])

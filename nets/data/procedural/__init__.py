@@ -14,7 +14,18 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from nets.data.procedural import fabric, manmade, masonry, metal, mineral, wood
+from nets.data.procedural import (
+    fabric,
+    manmade,
+    masonry,
+    metal,
+    mineral,
+    pavement,
+    plate,
+    sheet,
+    upholstery,
+    wood,
+)
 from nets.data.procedural.compose import MaterialMaps, normal_from_height
 
 __all__ = [
@@ -40,6 +51,10 @@ _ALL: tuple[Family, ...] = (
     *(metal.galvanized, metal.rusted_paint, metal.flake_paint),
     *(manmade.paper, manmade.cardboard, manmade.plastic_grain, manmade.printed_plastic),
     *(manmade.rubber_mat, manmade.cracked_paint),
+    *(plate.tread_plate, plate.stamped_sheet, plate.knurled_metal, plate.wire_mesh),
+    *(sheet.corrugated_sheet, sheet.riveted_panel, sheet.pressed_tin),
+    *(pavement.setts, pavement.rounded_cobbles, pavement.pillowed_tile),
+    *(upholstery.tufted_leather, upholstery.quilted_leather),
 )
 
 FAMILIES: dict[str, Family] = {family.__name__: family for family in _ALL}
