@@ -9,12 +9,16 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from nets.color import GAMMA
 from nets.generator import svbrdf_to_maps
 from nets.render import Camera, PointLight, render
 from nets.svbrdf import CHANNELS, MAPS, SVBRDF
 
 LOG_OFFSET = 0.01
 """Added to linear radiance before the logarithm (Deschaintre et al. 2018, Gao et al. 2019)."""
+
+ENCODING_FLOOR = 1e-3
+"""Radiance below this counts as black in `encoded_l1`: the encoding's slope grows without bound towards 0."""
 
 
 def map_l1(estimate: SVBRDF, truth: SVBRDF) -> dict[str, Float[Tensor, ""]]:
@@ -31,6 +35,45 @@ def log_l1(
     return (torch.log(image + offset) - torch.log(reference + offset)).abs().mean()
 
 
+def encoded_l1(image: Float[Tensor, "*shape"], reference: Float[Tensor, "*shape"]) -> Float[Tensor, ""]:
+    """Return the mean absolute difference of gamma-encoded pictures; radiance above 1 is not clipped here."""
+    encoded, other = (x.clamp(min=ENCODING_FLOOR) ** (1.0 / GAMMA) for x in (image, reference))
+    return (encoded - other).abs().mean()
+
+
+def rendering_pair(
+    estimate: SVBRDF, truth: SVBRDF, lights: PointLight, camera: Camera | None = None
+) -> tuple[Float[Tensor, "n 3 h w"], Float[Tensor, "n 3 h w"]]:
+    """Render both materials under the same lights, white from 1 on.
+
+    Args:
+        estimate: a batch of materials.
+        truth: the same batch, ground truth; nothing flows back through it.
+        lights: as many as materials, or a multiple: light i lights material i mod batch.
+        camera: shared by both renderings.
+
+    Returns:
+        Linear radiance of the estimate, and of the truth in [0, 1].
+    """
+    repeats = lights.position.shape[0] // estimate.batch
+    rendering = render(estimate.map(lambda t: t.repeat(repeats, 1, 1, 1)), lights, camera)
+    with torch.no_grad():
+        reference = render(truth.map(lambda t: t.repeat(repeats, 1, 1, 1)), lights, camera)
+    return white_from_one(rendering, reference)
+
+
+def white_from_one(
+    rendering: Float[Tensor, "n 3 h w"], reference: Float[Tensor, "n 3 h w"]
+) -> tuple[Float[Tensor, "n 3 h w"], Float[Tensor, "n 3 h w"]]:
+    """Clip two pictures as a camera would, the estimate only where clipping hides nothing.
+
+    Where the reference is white, brighter is not wrong, and darker only as far as one can see. Elsewhere a
+    rendering above 1 keeps its value, and with it its gradient.
+    """
+    shown = torch.where(reference < 1.0, rendering, rendering.clamp(max=1.0))
+    return shown, reference.clamp(max=1.0)
+
+
 def rendering_log_l1(
     estimate: SVBRDF,
     truth: SVBRDF,
@@ -38,22 +81,16 @@ def rendering_log_l1(
     camera: Camera | None = None,
     offset: float = LOG_OFFSET,
 ) -> Float[Tensor, ""]:
-    """Return the log L1 distance of both materials rendered under the same lights, white from 1 on.
+    """Return the log L1 distance of both materials' renderings; arguments as `rendering_pair`.
 
     Args:
         estimate: a batch of materials.
         truth: the same batch, ground truth.
-        lights: as many as materials, or a multiple: light i lights material i mod batch.
+        lights: as many as materials, or a multiple.
         camera: shared by both renderings.
         offset: see `log_l1`; a larger one cares less for dark pixels.
     """
-    repeats = lights.position.shape[0] // estimate.batch
-    rendering = render(estimate.map(lambda t: t.repeat(repeats, 1, 1, 1)), lights, camera)
-    with torch.no_grad():
-        reference = render(truth.map(lambda t: t.repeat(repeats, 1, 1, 1)), lights, camera)
-    # A picture is white from 1 on: there, brighter is not wrong, and darker only as far as one can see.
-    rendering = torch.where(reference < 1.0, rendering, rendering.clamp(max=1.0))
-    return log_l1(rendering, reference.clamp(max=1.0), offset)
+    return log_l1(*rendering_pair(estimate, truth, lights, camera), offset)
 
 
 def light_l1(estimate: Float[Tensor, "b 3"], truth: Float[Tensor, "b 3"]) -> Float[Tensor, ""]:

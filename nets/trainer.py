@@ -1,127 +1,67 @@
-"""The generic trainer: network + batches + objective, resumable to the bit, best kept by moving average.
+"""The generic trainer: network, critics, batches, objective; resumable to the bit, on one process or many.
 
-It knows nothing of losses: an objective is any callable `(network, batch, generator) -> (loss, terms)`.
+It knows nothing of losses: an objective is any callable that turns networks and a batch into `Losses`.
 """
 
 from __future__ import annotations
 
+import contextlib
 import copy
-import math
 import time
-from collections.abc import Callable
+from collections.abc import Iterator
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
-from nets.color import to_network_input
 from nets.generator import Generator
-from nets.render import PointLight
-from nets.svbrdf import SVBRDF
-
-Terms = dict[str, Tensor]
-"""Named parts of a loss."""
-
-
-@dataclass(frozen=True)
-class TrainingBatch:
-    """What an objective sees: linear photos, the materials behind them, the lights that lit them."""
-
-    photo: Tensor
-    truth: SVBRDF
-    light: PointLight
-
-    @property
-    def network_input(self) -> Tensor:
-        """The photos encoded to [-1, 1]."""
-        return to_network_input(self.photo).contiguous(memory_format=torch.channels_last)
-
-
-Objective = Callable[[Generator, TrainingBatch, torch.Generator], tuple[Tensor, Terms]]
-BatchSource = Callable[[int, int, torch.Generator], TrainingBatch]
-"""`(batch size, crop in pixels, generator) -> batch`."""
-
-
-@dataclass(frozen=True)
-class Phase:
-    """A stretch of training at one crop size. The learning rate decays along a cosine over all phases."""
-
-    iterations: int
-    crop: int
-    batch: int
-
-
-@dataclass(frozen=True)
-class TrainerConfig:
-    """Everything that decides what a training does, given network, data and objective.
-
-    Attributes:
-        phases: crop and batch sizes in order.
-        learning_rate: Adam's, after `warmup` iterations.
-        final_learning_rate: at the last iteration.
-        beta1: Adam's (0.5 in the paper).
-        ema_decay: of the moving average of the weights.
-        gradient_clip: largest norm of the gradient.
-        seed: of weights, data and dropout.
-        low_precision: run convolutions in bfloat16 (weights stay float32).
-    """
-
-    phases: tuple[Phase, ...]
-    learning_rate: float = 8e-4
-    final_learning_rate: float = 2e-5
-    beta1: float = 0.5
-    warmup: int = 100
-    ema_decay: float = 0.999
-    gradient_clip: float = 1.0
-    seed: int = 0
-    low_precision: bool = True
-
-    @property
-    def iterations(self) -> int:
-        """Length of all phases together."""
-        return sum(phase.iterations for phase in self.phases)
-
-    def phase_at(self, iteration: int) -> Phase:
-        """Return the phase that iteration (0-based) belongs to."""
-        for phase in self.phases:
-            if iteration < phase.iterations:
-                return phase
-            iteration -= phase.iterations
-        return self.phases[-1]
-
-    def learning_rate_at(self, iteration: int) -> float:
-        """Linear warm-up, then a cosine from `learning_rate` to `final_learning_rate`."""
-        progress = min(1.0, iteration / max(1, self.iterations))
-        cosine = 0.5 * (1.0 + math.cos(math.pi * progress))
-        rate = self.final_learning_rate + (self.learning_rate - self.final_learning_rate) * cosine
-        return rate * min(1.0, (iteration + 1) / max(1, self.warmup))
+from nets.training import Alone, BatchSource, Objective, Phase, Team, Terms, TrainerConfig
 
 
 @dataclass
 class Trainer:
-    """One training: call `step` until `done`; `save` and `resume` at any moment."""
+    """One training: call `step` until `done`; `save` and `resume` at any moment.
+
+    Random numbers are a function of seed, iteration and shard alone: a resumed training draws what an
+    uninterrupted one would, and which process draws it does not matter.
+    """
 
     network: Generator
     source: BatchSource
     objective: Objective
     config: TrainerConfig
+    critics: nn.ModuleDict = field(default_factory=nn.ModuleDict)
+    team: Team = field(default_factory=Alone)
     iteration: int = 0
     seconds: float = 0.0
     samples: int = 0
     averages: dict[str, float] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        """Seed the random streams and build optimizer and moving average."""
+        """Place the networks and build optimizers and moving average.
+
+        Raises:
+            ValueError: shards of a phase do not divide among the processes.
+        """
         torch.set_flush_denormal(True)  # dying activations become denormal and several times slower
-        torch.manual_seed(self.config.seed)
-        self.generator = torch.Generator().manual_seed(self.config.seed)
-        self.rank, self.world = _rank_and_world()
-        self.network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+        for phase in self.config.phases:
+            if phase.shards % self.team.world:
+                raise ValueError(
+                    f"{phase.shards} shards do not divide among {self.team.world} processes; "
+                    f"give a multiple of {self.team.world}"
+                )
+        for players in (self.network, self.critics):
+            players.to(device=self.team.device, memory_format=torch.channels_last)  # type: ignore[call-overload]
         self.average = copy.deepcopy(self.network).eval().requires_grad_(False)
-        self.optimizer = torch.optim.Adam(
-            self.network.parameters(), lr=self.config.learning_rate, betas=(self.config.beta1, 0.999)
+        self.optimizer = self._adam(self.network)
+        self.critic_optimizer = self._adam(self.critics) if len(self.critics) else None
+
+    def _adam(self, players: nn.Module) -> torch.optim.Adam:
+        return torch.optim.Adam(
+            players.parameters(), lr=self.config.learning_rate, betas=(self.config.beta1, 0.999)
         )
 
     @property
@@ -130,33 +70,68 @@ class Trainer:
         return self.iteration >= self.config.iterations
 
     def step(self) -> dict[str, float]:
-        """Run one iteration; return the loss and its terms."""
+        """Run one iteration; return the loss and its terms, averaged over shards and processes."""
         start = time.perf_counter()
         phase = self.config.phase_at(self.iteration)
-        for group in self.optimizer.param_groups:
-            group["lr"] = self.config.learning_rate_at(self.iteration)
-        batch = self.source(phase.batch, phase.crop, self.generator)
         self.network.train()
-        with torch.autocast("cpu", dtype=torch.bfloat16, enabled=self.config.low_precision):
-            loss, terms = self.objective(self.network, batch, self.generator)
-        self.optimizer.zero_grad(set_to_none=True)
-        loss.backward()
-        if self.world > 1:
-            _average_gradients(list(self.network.parameters()), self.world)
-        norm = torch.nn.utils.clip_grad_norm_(self.network.parameters(), self.config.gradient_clip)
-        if bool(torch.isfinite(norm)):
-            self.optimizer.step()
+        for optimizer, factor in self._optimizers():
+            optimizer.zero_grad(set_to_none=True)
+            for group in optimizer.param_groups:
+                group["lr"] = factor * self.config.learning_rate_at(self.iteration)
+        own = range(self.team.rank, phase.shards, self.team.world)
+        values: dict[str, Tensor] = {}
+        for shard in own:
+            for name, value in self._accumulate(phase, shard, 1.0 / len(own)).items():
+                values[name] = values.get(name, 0.0) + value / len(own)
+        means = self._share(values)
+        for optimizer, _ in self._optimizers():
+            parameters = [p for group in optimizer.param_groups for p in group["params"]]
+            norm = torch.nn.utils.clip_grad_norm_(parameters, self.config.gradient_clip)
+            if bool(torch.isfinite(norm)):
+                optimizer.step()
         self._update_average()
         self.iteration += 1
-        self.samples += phase.batch * self.world
+        self.samples += phase.batch * phase.shards
         self.seconds += time.perf_counter() - start
-        values = {
-            "loss": float(loss.detach()),
-            **{name: float(term.detach()) for name, term in terms.items()},
-        }
-        for name, value in values.items():
-            self.averages[name] = 0.98 * self.averages.get(name, value) + 0.02 * value
-        return values
+        for name, mean in means.items():
+            self.averages[name] = 0.98 * self.averages.get(name, mean) + 0.02 * mean
+        return means
+
+    def _optimizers(self) -> Iterator[tuple[torch.optim.Adam, float]]:
+        yield self.optimizer, 1.0
+        if self.critic_optimizer is not None:
+            yield self.critic_optimizer, self.config.critic_factor
+
+    def _accumulate(self, phase: Phase, shard: int, weight: float) -> Terms:
+        """Add one shard's gradients to both players'."""
+        seed = stream_seed(self.config.seed, self.iteration, shard)
+        generator = torch.Generator().manual_seed(seed)
+        torch.manual_seed(seed)  # of dropout
+        batch = self.source(phase.batch, phase.crop, generator)
+        with self.team.autocast():
+            losses = self.objective(self.network, self.critics, batch, generator)
+        values = {"loss": losses.generator.detach()}
+        if losses.critics is not None:
+            values["critics"] = losses.critics.detach()
+            torch.autograd.backward(
+                losses.critics * weight, inputs=list(self.critics.parameters()), retain_graph=True
+            )
+        torch.autograd.backward(losses.generator * weight, inputs=list(self.network.parameters()))
+        return values | {name: term.detach() for name, term in losses.terms.items()}
+
+    def _share(self, values: Terms) -> dict[str, float]:
+        """Average gradients and logged values over the processes, in one message: latency would cost more."""
+        names = sorted(values)
+        logged = torch.stack([values[name].float().reshape(()).to(self.team.device) for name in names])
+        if self.team.world > 1:
+            players = [*self.network.parameters(), *self.critics.parameters()]
+            gradients = [p.grad for p in players if p.grad is not None]
+            parts = [*(gradient.reshape(-1) for gradient in gradients), logged]
+            means = self.team.mean(torch.cat(parts)).split([part.numel() for part in parts])
+            for gradient, mean in zip(gradients, means, strict=False):
+                gradient.copy_(mean.view_as(gradient))
+            logged = means[-1]
+        return dict(zip(names, logged.tolist(), strict=True))
 
     def _update_average(self) -> None:
         # A young average would remember the random start: let it grow old first.
@@ -175,13 +150,17 @@ class Trainer:
         }
 
     def save(self, path: Path) -> None:
-        """Write the full state; the file of before stays whole until the new one is."""
+        """Write the full state; the file of before stays whole until the new one is.
+
+        Raises:
+            OSError: it cannot be written, for instance on a full disk.
+        """
         state = {
             "network": self.network.state_dict(),
             "average": self.average.state_dict(),
+            "critics": self.critics.state_dict(),
             "optimizer": self.optimizer.state_dict(),
-            "generator": self.generator.get_state(),
-            "torch": torch.get_rng_state(),
+            "critic_optimizer": self.critic_optimizer.state_dict() if self.critic_optimizer else None,
             "iteration": self.iteration,
             "seconds": self.seconds,
             "samples": self.samples,
@@ -189,40 +168,73 @@ class Trainer:
         }
         path.parent.mkdir(parents=True, exist_ok=True)
         temporary = path.with_suffix(".partial")
-        torch.save(state, temporary)
-        temporary.replace(path)
+        try:
+            torch.save(state, temporary)
+            temporary.replace(path)
+        except (OSError, RuntimeError) as error:  # torch says RuntimeError when a disk is full
+            with contextlib.suppress(OSError):
+                temporary.unlink(missing_ok=True)
+            raise OSError(f"{path} cannot be written ({_first_line(error)}); what it was is kept") from error
 
     def resume(self, path: Path) -> None:
-        """Continue from a state written by `save`, as if never interrupted."""
-        state = torch.load(path, map_location="cpu", weights_only=True)
-        self.network.load_state_dict(state["network"])
-        self.average.load_state_dict(state["average"])
-        self.optimizer.load_state_dict(state["optimizer"])
-        self.generator.set_state(state["generator"])
-        torch.set_rng_state(state["torch"])
-        self.iteration, self.seconds = state["iteration"], state["seconds"]
-        self.samples, self.averages = state["samples"], state["averages"]
-        self.diverge()
+        """Continue from a state written by `save`, as if never interrupted.
 
-    def diverge(self) -> None:
-        """Give every process but the first its own random streams, by rank and iteration."""
-        if self.rank > 0:
-            seed = hash((self.config.seed, self.rank, self.iteration)) % 2**63
-            self.generator.manual_seed(seed)
-            torch.manual_seed(seed)
+        Raises:
+            ValueError: the state is of other networks, or no state at all.
+        """
+        state = self._load(path)
+        try:
+            self.network.load_state_dict(state["network"])
+            self.average.load_state_dict(state["average"])
+            self.critics.load_state_dict(state["critics"])
+            self.optimizer.load_state_dict(state["optimizer"])
+            if self.critic_optimizer is not None:
+                self.critic_optimizer.load_state_dict(state["critic_optimizer"])
+            self.iteration, self.seconds = state["iteration"], state["seconds"]
+            self.samples, self.averages = state["samples"], state["averages"]
+        except (KeyError, RuntimeError, ValueError, TypeError, AttributeError) as error:
+            raise ValueError(
+                f"{path} is the state of another network or objective ({_first_line(error)}); "
+                f"start it anew elsewhere"
+            ) from None
+
+    def adopt(self, path: Path) -> None:
+        """Start from the networks of another training's state: the stage before this one.
+
+        Critics that both have are taken too; optimizers and counters start anew.
+
+        Raises:
+            ValueError: the state's generator is another one, or it is no state at all.
+        """
+        state = self._load(path)
+        try:
+            self.network.load_state_dict(state["network"])
+            self.average.load_state_dict(state["average"])
+            for name, critic in self.critics.items():
+                prefix = f"{name}."
+                known = state["critics"].items()
+                own = {k.removeprefix(prefix): v for k, v in known if k.startswith(prefix)}
+                if own:
+                    critic.load_state_dict(own)
+        except (KeyError, RuntimeError) as error:
+            raise ValueError(f"{path} is the state of another network ({_first_line(error)})") from None
+
+    def _load(self, path: Path) -> dict[str, Any]:
+        try:
+            state = torch.load(path, map_location=self.team.device, weights_only=True)
+        except Exception as error:  # torch names no common base of what a damaged file raises
+            raise ValueError(f"{path} is not the state of a training ({_first_line(error)})") from None
+        if not isinstance(state, dict) or not {"network", "average", "critics"} <= state.keys():
+            raise ValueError(f"{path} is not the state of a training")
+        return state
 
 
-def _rank_and_world() -> tuple[int, int]:
-    if torch.distributed.is_available() and torch.distributed.is_initialized():
-        return torch.distributed.get_rank(), torch.distributed.get_world_size()
-    return 0, 1
+def stream_seed(seed: int, iteration: int, shard: int) -> int:
+    """Return the seed of a shard's random numbers: far apart for neighbours, the same on every machine."""
+    return int(np.random.SeedSequence([seed, iteration, shard]).generate_state(1, np.uint64)[0] >> 1)
 
 
-def _average_gradients(parameters: list[torch.nn.Parameter], world: int) -> None:
-    # One message for all: the network is small and the latency of many would cost more.
-    gradients = [parameter.grad for parameter in parameters if parameter.grad is not None]
-    flat = torch.cat([gradient.reshape(-1) for gradient in gradients])
-    torch.distributed.all_reduce(flat)
-    flat /= world
-    for gradient, part in zip(gradients, flat.split([g.numel() for g in gradients]), strict=True):
-        gradient.copy_(part.view_as(gradient))
+def _first_line(error: Exception) -> str:
+    """Return the part of an error's message that says what is wrong: torch's are headings and long lists."""
+    lines = [line.strip() for line in str(error).splitlines() if line.strip()] or [type(error).__name__]
+    return lines[1] if lines[0].endswith(":") and len(lines) > 1 else lines[0]
