@@ -1,86 +1,64 @@
-"""`refine-train`: composes data, network, objective and trainer; the rim around `nets.trainer`.
-
-Several processes share the work when started by torchrun (own batches, averaged gradients), for example
-`torchrun --nproc-per-node 2 -m refine.train --pool ... --threads 1`.
-"""
+"""`refine-train`: composes plan, data, networks, objective and trainer; the rim around `nets.trainer`."""
 
 from __future__ import annotations
 
-import json
-import os
-import time
-from dataclasses import asdict
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any
 
 import torch
 import typer
 
-from losses.objective import L1Objective
+from losses.score import build_critics
+from losses.vgg_weights import load_vgg16
+from losses.with_vgg import give_vgg, needs_vgg
 from nets.checkpoint import Record, save_model
-from nets.data import DataError
 from nets.data.augment import Augmentation, augment
+from nets.data.images import DataError
+from nets.data.materials import Materials, open_materials
+from nets.data.pairs import PhotoPairs
 from nets.data.photography import FlashPhotography
-from nets.data.pool import MaterialPool, decode
-from nets.generator import NARROW_GENERATOR, Generator, GeneratorConfig
-from nets.trainer import BatchSource, Phase, Trainer, TrainerConfig, TrainingBatch
+from nets.generator import Generator
+from nets.trainer import Trainer
+from nets.training import BatchSource, TrainingBatch
+from refine.team import FabricTeam, process_count
+from refine.training_plan import PlanError, Stage, TrainingPlan, read_plan
+from refine.training_watch import Watch
 
-POOL_SHARES = {"procedural": 0.5, "pbr": 0.3, "infinigen": 0.2}
-"""How often a training material is generated here, scanned, or baked with infinigen (many are plain)."""
-
-AUGMENTATION = Augmentation(specular=0.4, exposure=0.4)
-"""Wider than the default in specular and albedo: few training materials lie between plastic and metal."""
-
-DEFAULT_PHASES = "3500:128:8,3500:256:4"
+STATE = "state.pt"
+"""In a stage's folder: all that is needed to go on."""
 
 LOG_EVERY = 50
-"""Iterations between lines of the log."""
+"""Iterations between lines of the log and TensorBoard's scalars."""
 
 
 def batch_source(
-    pool: MaterialPool,
-    augmentation: Augmentation = AUGMENTATION,
+    materials: Materials,
+    augmentation: Augmentation | None = None,
     photography: FlashPhotography | None = None,
-    shares: dict[str, float] | None = None,
+    pairs: PhotoPairs | None = None,
+    pair_count: int = 0,
+    device: torch.device | None = None,
 ) -> BatchSource:
-    """Return the trainer's source: pool -> augmentation -> simulated flash photo.
+    """Return the trainer's source: material -> augmentation -> simulated flash photo, and real pairs.
 
     Args:
-        pool: materials to draw from.
+        materials: to draw from.
         augmentation: how they are varied.
         photography: how they are photographed.
-        shares: how often each collection is drawn; those the pool lacks are left out. None draws every
-            entry alike.
+        pairs: real photos of surfaces under two lights.
+        pair_count: how many of them join a batch.
+        device: where batches are computed on.
     """
     camera = photography or FlashPhotography()
-    wanted = shares or {}
-    held = {entry.collection if entry.collection in wanted else entry.kind for entry in pool.index}
-    present = {name: share for name, share in wanted.items() if name in held} or None
 
     def source(batch: int, crop: int, generator: torch.Generator) -> TrainingBatch:
-        material = decode(pool.sample(batch, generator, present))
-        truth = augment(material, generator, size=crop, settings=augmentation)
+        truth = augment(materials.draw(batch, generator), generator, size=crop, settings=augmentation)
         photo, light = camera.take(truth, generator)
-        return TrainingBatch(photo, truth, light)
+        real = pairs.sample(pair_count, crop, generator) if pairs is not None and pair_count else None
+        return TrainingBatch(photo, truth, light, real).to(device or torch.device("cpu"))
 
     return source
-
-
-def parse_phases(text: str) -> tuple[Phase, ...]:
-    """Read `iterations:crop:batch,...`, for example `4000:128:8,2000:256:4`.
-
-    Raises:
-        ValueError: text of another form.
-    """
-    try:
-        phases = tuple(Phase(*(int(number) for number in part.split(":"))) for part in text.split(","))
-        if min(number for phase in phases for number in asdict(phase).values()) < 1:
-            raise ValueError
-    except (TypeError, ValueError):
-        raise ValueError(
-            f"--phases {text!r} is not iterations:crop:batch,...; give for example {DEFAULT_PHASES}"
-        ) from None
-    return phases
 
 
 app = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
@@ -88,89 +66,181 @@ app = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
 
 @app.command()
 def train(
-    pool: Annotated[Path, typer.Option(help="Material pool written by `python -m nets.data.pool`.")],
-    out: Annotated[Path, typer.Option(help="Folder of the run: state, weights, log.")],
-    phases: Annotated[str, typer.Option(help="iterations:crop:batch, comma-separated.")] = DEFAULT_PHASES,
-    width: Annotated[int, typer.Option(help="First layer's channels; 64 in the paper.")] = (
-        NARROW_GENERATOR.width
-    ),
-    levels: Annotated[int, typer.Option(help="Encoder levels; 8 in the paper.")] = NARROW_GENERATOR.levels,
-    deep_multiplier: Annotated[
-        int, typer.Option(help="Widest layer as a multiple of the width; 8 in the paper.")
-    ] = NARROW_GENERATOR.deep_multiplier,
-    shading_cues: Annotated[
-        bool, typer.Option(help="Let the network see first-order shading cues; not in the paper.")
-    ] = NARROW_GENERATOR.shading_cues,
-    detail_channels: Annotated[
-        int, typer.Option(help="Of the full-resolution layers; 0 as in the paper.")
-    ] = NARROW_GENERATOR.detail_channels,
-    learning_rate: Annotated[float, typer.Option(help="Adam's peak learning rate.")] = 8e-4,
-    ema_decay: Annotated[float, typer.Option(help="Of the moving average that is written.")] = 0.999,
-    seed: Annotated[int, typer.Option(help="Seed of weights, data and dropout.")] = 0,
-    threads: Annotated[int, typer.Option(help="CPU threads of each process.")] = 1,
-    resume: Annotated[bool, typer.Option(help="Continue from the run's state if there is one.")] = False,
-    save_every: Annotated[int, typer.Option(help="Iterations between saved states.")] = 250,
+    config: Annotated[Path, typer.Option(help="Plan of the training, such as configs/narrow.yaml.")],
+    data: Annotated[
+        Path, typer.Option(help="Materials: a pool of `python -m nets.data.pool`, or a folder of strips.")
+    ],
+    out: Annotated[Path, typer.Option(help="Folder of the run; every stage gets one in it.")],
+    pairs: Annotated[
+        Path | None, typer.Option(help="Real pairs: a folder per surface, for hybrid stages.")
+    ] = None,
+    stage: Annotated[
+        list[str] | None, typer.Option(help="Only these stages of the plan, in its order; repeatable.")
+    ] = None,
+    start: Annotated[
+        Path | None, typer.Option(help="State (state.pt) whose networks the first stage starts from.")
+    ] = None,
+    resume: Annotated[bool, typer.Option(help="Continue from the run's states where there are any.")] = False,
+    steps: Annotated[
+        int | None, typer.Option(help="Stop after so many iterations in all, as if interrupted.", min=1)
+    ] = None,
+    vgg: Annotated[Path | None, typer.Option(help="Weights of VGG-16; else those fetched before.")] = None,
+    accelerator: Annotated[str, typer.Option(help="cpu, cuda or auto.")] = "auto",
+    devices: Annotated[int, typer.Option(help="Processes on this machine, a device each.", min=1)] = 1,
+    nodes: Annotated[int, typer.Option(help="Machines.", min=1)] = 1,
+    threads: Annotated[int, typer.Option(help="CPU threads of each process.", min=1)] = 1,
+    seed: Annotated[int, typer.Option(help="Of weights, data and dropout.")] = 0,
+    save_every: Annotated[int, typer.Option(help="Iterations between saved states.", min=1)] = 250,
     data_note: Annotated[
         list[str] | None, typer.Option(help="A data source and its licence, for the header; repeatable.")
     ] = None,
 ) -> None:
-    """Train a generator with the L1 objective and write `<out>/weights.safetensors`."""
-    torch.set_num_threads(threads)
-    if "RANK" in os.environ:
-        torch.distributed.init_process_group("gloo")
+    """Train the stages of a plan, each from the networks of the one before.
+
+    Writes `weights.safetensors` (moving average), `state.pt`, `log.jsonl`, `samples.png` and a TensorBoard
+    log to `<out>/<stage>/`.
+    """
     try:
-        config = TrainerConfig(
-            phases=parse_phases(phases), learning_rate=learning_rate, ema_decay=ema_decay, seed=seed
-        )
-        architecture = GeneratorConfig(width, levels, deep_multiplier, shading_cues, detail_channels)
-        for phase in config.phases:
-            if phase.crop % architecture.multiple:
-                raise ValueError(
-                    f"--phases {phases!r} has a crop of {phase.crop} pixels; "
-                    f"{levels} levels need multiples of {architecture.multiple}"
+        # Everything that can be wrong is looked at first: before any process starts, and any hour is spent.
+        plan = read_plan(config)
+        stages = _chosen(plan, stage)
+        _check_shards(stages, process_count(devices, nodes))
+        origins = {one.name: _origin(one, plan, stages, out, start) for one in stages}
+        _check_folders(stages, out, resume)
+        materials = {part: open_materials(data, part, plan.shares) for part in ("train", "validation")}
+        photos = _open_pairs(pairs, stages)
+        weights = load_vgg16(vgg) if any(needs_vgg(one.objective) for one in stages) else {}
+        team = FabricTeam(accelerator=accelerator, devices=devices, nodes=nodes, precision=plan.precision)
+        torch.set_num_threads(threads)  # after the launch, which has ideas of its own
+        weights = {name: value.to(team.device) for name, value in weights.items()}
+        if team.rank == 0:
+            for reason in (*materials["train"].skipped, *(photos.skipped if photos else ())):
+                typer.echo(f"refine-train: skipped: {reason}", err=True)
+        left = steps
+        for one in stages:
+            torch.manual_seed(seed)
+            objective = give_vgg(one.objective, weights)
+            training, validation = (
+                batch_source(
+                    materials[part], plan.augmentation, plan.photography, photos, one.pairs, team.device
                 )
-        materials = MaterialPool(pool, part="train")
-    except (DataError, ValueError) as error:
-        typer.echo(f"refine-train: {error}", err=True)
+                for part in ("train", "validation")
+            )
+            trainer = Trainer(
+                Generator(plan.generator),
+                training,
+                objective,
+                replace(one.trainer, seed=seed),
+                build_critics(objective.judged, **plan.critics),
+                team,
+            )
+            folder = out / one.name
+            origin = origins[one.name]
+            if resume and (folder / STATE).exists():
+                trainer.resume(folder / STATE)
+            elif origin is not None:
+                trainer.adopt(origin)
+            facts = {**plan.as_dict(one), "processes": team.world}
+            left = _run(trainer, folder, facts, data_note or [], save_every, left, validation)
+            if left == 0:
+                break
+    except (DataError, PlanError, ValueError, OSError) as error:
+        typer.echo(f"refine-train: {' '.join(str(error).split())}", err=True)
         raise typer.Exit(2) from None
 
-    torch.manual_seed(seed)
-    objective, photography = L1Objective(), FlashPhotography()
-    source = batch_source(materials, AUGMENTATION, photography, POOL_SHARES)
-    trainer = Trainer(Generator(architecture), source, objective, config)
-    state = out / "state.pt"
-    if resume and state.exists():
-        trainer.resume(state)
-    trainer.diverge()
-    settings = {
-        "objective": asdict(objective),
-        "photography": asdict(photography),
-        "augmentation": asdict(AUGMENTATION),
-        "shares": POOL_SHARES,
-        "processes": trainer.world,
-    }
-    while not trainer.done:
-        trainer.step()
-        if trainer.rank > 0:
-            continue
-        if trainer.iteration % LOG_EVERY == 0:
-            _log(out / "log.jsonl", trainer)
-        if trainer.iteration % save_every == 0 or trainer.done:
-            trainer.save(state)
-            record = Record(architecture, {**trainer.record(), **settings}, data_note or [])
-            save_model(out / "weights.safetensors", trainer.average, record)
+
+def _run(
+    trainer: Trainer,
+    folder: Path,
+    facts: dict[str, Any],
+    notes: list[str],
+    save_every: int,
+    left: int | None,
+    validation: BatchSource,
+) -> int | None:
+    """Train one stage to its end, or until `left` iterations are used up; return how many are left."""
+    watch = Watch(folder, validation) if trainer.team.rank == 0 else None
+    try:
+        while not trainer.done and left != 0:
+            trainer.step()
+            left = None if left is None else left - 1
+            if watch is None:
+                continue
+            if trainer.iteration % LOG_EVERY == 0:
+                watch.log(trainer)
+            if trainer.iteration % save_every == 0 or trainer.done or left == 0:
+                trainer.save(folder / STATE)
+                record = Record(trainer.network.config, {**trainer.record(), **facts}, notes)
+                save_model(folder / "weights.safetensors", trainer.average, record)
+                watch.validate(trainer)
+    finally:
+        if watch is not None:
+            watch.close()
+    # A barrier: the next stage starts from the state that the first process has just written.
+    trainer.team.mean(torch.zeros(1, device=trainer.team.device))
+    return left
 
 
-def _log(path: Path, trainer: Trainer) -> None:
-    line: dict[str, Any] = {
-        "iteration": trainer.iteration,
-        "samples_per_second": round(trainer.samples / trainer.seconds, 2),
-        "time": time.strftime("%H:%M:%S"),
-        **{name: round(value, 5) for name, value in trainer.averages.items()},
-    }
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with path.open("a") as log:
-        log.write(json.dumps(line) + "\n")
+def _chosen(plan: TrainingPlan, names: list[str] | None) -> list[Stage]:
+    known = [stage.name for stage in plan.stages]
+    unknown = [name for name in names or [] if name not in known]
+    if unknown:
+        raise PlanError(f"--stage {unknown[0]} is not in the plan; it has {', '.join(known)}")
+    return [stage for stage in plan.stages if not names or stage.name in names]
+
+
+def _open_pairs(folder: Path | None, stages: list[Stage]) -> PhotoPairs | None:
+    if not any(stage.pairs for stage in stages):
+        return None
+    if folder is None:
+        raise PlanError("a stage trains on real pairs; give their folder with --pairs")
+    crops = [phase.crop for stage in stages if stage.pairs for phase in stage.trainer.phases]
+    return PhotoPairs(folder, crop=max(crops))
+
+
+def _check_shards(stages: list[Stage], processes: int) -> None:
+    for stage in stages:
+        for phase in stage.trainer.phases:
+            if phase.shards % processes:
+                raise PlanError(
+                    f"stage {stage.name} has phases of {phase.shards} shards, which do not divide among "
+                    f"{processes} processes; give it shards in multiples of {processes}"
+                )
+
+
+def _origin(
+    stage: Stage, plan: TrainingPlan, chosen: list[Stage], out: Path, start: Path | None
+) -> Path | None:
+    """Return the state whose networks a stage starts from; None for the plan's first.
+
+    It is that of the stage trained before it in this run; else `--start`; else that of the stage before it in
+    the plan, from a run of before.
+    """
+    earlier = chosen[: chosen.index(stage)]
+    if earlier:
+        return out / earlier[-1].name / STATE
+    if start is not None:
+        if not start.is_file():
+            raise PlanError(f"--start {start} is not a file")
+        return start
+    number = plan.stages.index(stage)
+    if number == 0:
+        return None
+    origin = out / plan.stages[number - 1].name / STATE
+    if not (origin.is_file() or (out / stage.name / STATE).is_file()):
+        raise PlanError(
+            f"stage {stage.name} starts from the networks of {plan.stages[number - 1].name}, but there is no "
+            f"{origin}; train that first, or give a state with --start"
+        )
+    return origin
+
+
+def _check_folders(stages: list[Stage], out: Path, resume: bool) -> None:
+    for stage in stages:
+        if (out / stage.name / STATE).exists() and not resume:
+            raise PlanError(
+                f"{out / stage.name} holds a training already; go on with --resume or give another --out"
+            )
 
 
 def main() -> None:

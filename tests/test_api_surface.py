@@ -29,10 +29,12 @@ PUBLIC = {
     "nets.render": "Camera Conventions PRESETS PointLight render",
     "nets.sampling": "LightDistribution",
     "nets.svbrdf": "CHANNELS MAPS SVBRDF",
-    "nets.trainer": "Phase Trainer TrainerConfig TrainingBatch",
+    "nets.trainer": "Trainer",
+    "nets.training": "Alone Losses Objective Phase Team TrainerConfig TrainingBatch",
     "nets.data": "DataError",
     "nets.data.procedural": "FAMILIES generate random_material",
-    "losses.objective": "L1Objective",
+    "losses.objective": "HybridObjective L1Objective RealObjective SyntheticObjective",
+    "losses.presets": "AS_CODED NARROW PAPER PRESETS find_objective",
     "losses.perceptual": "LPIPS",
     "losses.refinement": "photo_distance",
 }
@@ -60,8 +62,8 @@ SCRIPTS = {"refine", "refine-train", "refine-eval"}
 OPTIONS = {
     "refine.cli": "light falloff camera color-space resolution init recipe iters quick seed out format "
     "normals no-report json quiet device threads version",
-    "refine.train": "pool out phases width levels deep-multiplier learning-rate seed threads resume "
-    "save-every data-note",
+    "refine.train": "config data out pairs stage start resume steps vgg accelerator devices nodes threads "
+    "seed save-every data-note",
 }
 
 

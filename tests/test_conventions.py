@@ -54,7 +54,7 @@ from nets.render import (
 )
 from nets.sampling import PAPER_LIGHTS
 from nets.svbrdf import CHANNELS, MAPS, SVBRDF
-from nets.trainer import TrainingBatch
+from nets.training import TrainingBatch
 from refine.capture import Capture
 from refine.errors import UserError
 from refine.fidelity import rerendering_rmse

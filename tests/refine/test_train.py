@@ -1,30 +1,46 @@
-"""`refine-train`: what it is asked, what it draws from a pool, and a tiny training from end to end."""
+"""`refine-train`: what it is asked, what it draws, and tiny trainings from end to end."""
 
 from __future__ import annotations
 
 import json
+import math
+import shutil
 from collections import Counter
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+import OpenImageIO as oiio
 import pytest
 import torch
 from typer.testing import CliRunner
 
 from nets.checkpoint import load_model, read_record
-from nets.data import pool as pool_module
 from nets.data.augment import Augmentation
+from nets.data.materials import PoolMaterials
+from nets.data.pairs import PhotoPairs
 from nets.data.photography import FlashPhotography
-from nets.data.pool import Entry, MaterialPool, build_pool
+from nets.data.pool import MaterialPool
 from nets.generator import GeneratorConfig
 from nets.render import render
-from nets.trainer import Phase
+from nets.svbrdf import MAPS
 from refine import Refiner, train
-from refine.train import AUGMENTATION, POOL_SHARES, batch_source, parse_phases
-from tests.helpers import assert_close, random_svbrdf, seeded
+from refine.train import STATE, batch_source
+from refine.training_watch import SHEET_MATERIALS
+from tests.helpers import assert_close, seeded
+from tests.training_files import (
+    GENERATOR,
+    STAGES,
+    entry,
+    write_pairs,
+    write_plan,
+    write_pool,
+    write_strips,
+)
 
-TINY = ("--width", "2", "--levels", "5", "--deep-multiplier", "2")
+Command = Callable[..., tuple[int, str]]
+SHARES = {"procedural": 0.5, "pbr": 0.3, "infinigen": 0.2}
 
 
 @pytest.fixture(autouse=True)
@@ -35,38 +51,30 @@ def _threads() -> Iterator[None]:
     torch.set_num_threads(threads)
 
 
-def write_pool(folder: Path, *entries: Entry) -> Path:
-    """Store random materials under the given names and kinds."""
-
-    def make(entry: Entry, size: int) -> torch.Tensor:
-        return pool_module.encode(random_svbrdf(1, size, size, seed=entry.seed))
-
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(pool_module, "make", make)
-        patch.setattr(pool_module, "plan", lambda *arguments, **more: list(entries))
-        build_pool(folder, size=40, procedural=len(entries), workers=0)
-    return folder
-
-
-def entry(name: str, kind: str, collection: str, seed: int) -> Entry:
-    return Entry(name, kind, collection, "whole", seed, "Apache-2.0")
+@pytest.fixture(scope="module")
+def pool(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    entries = [entry(f"brick_{seed}", "procedural", "brick", seed) for seed in range(20)]
+    entries += [entry(f"infinigen__{seed}", "pbr", "infinigen", seed) for seed in range(20, 40)]
+    return write_pool(tmp_path_factory.mktemp("pool") / "pool", entries)
 
 
 @pytest.fixture(scope="module")
-def pool(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return write_pool(
-        tmp_path_factory.mktemp("pool") / "pool",
-        *(entry(f"brick_{seed}", "procedural", "brick", seed) for seed in range(5)),
-        *(entry(f"infinigen__{seed}", "pbr", "infinigen", seed) for seed in range(5, 8)),
-    )
+def strips(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_strips(tmp_path_factory.mktemp("strips"), 4)
+
+
+@pytest.fixture(scope="module")
+def pairs(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_pairs(tmp_path_factory.mktemp("pairs"))
 
 
 @pytest.fixture
-def command(pool: Path) -> Callable[..., tuple[int, str]]:
+def command(pool: Path, tmp_path: Path) -> Command:
     """Return the command line; it gives the exit code and what was said."""
 
-    def run(*arguments: str | Path, pool: Path = pool) -> tuple[int, str]:
-        done = CliRunner().invoke(train.app, ["--pool", str(pool), *TINY, *map(str, arguments)])
+    def run(*arguments: str | Path, data: Path = pool, out: str = "run") -> tuple[int, str]:
+        asked = ["--data", data, "--out", tmp_path / out, "--accelerator", "cpu", *arguments]
+        done = CliRunner().invoke(train.app, list(map(str, asked)))
         if done.exception is not None and not isinstance(done.exception, SystemExit):
             raise done.exception
         return done.exit_code, done.stderr
@@ -74,45 +82,64 @@ def command(pool: Path) -> Callable[..., tuple[int, str]]:
     return run
 
 
-# Phases
+def lines_of(folder: Path) -> list[dict[str, Any]]:
+    return [json.loads(line) for line in (folder / "log.jsonl").read_text().splitlines()]
 
 
-def test_phases_are_iterations_crop_and_batch() -> None:
-    assert parse_phases("4000:128:8,2000:256:4") == (Phase(4000, 128, 8), Phase(2000, 256, 4))
-    assert parse_phases("1:32:1") == (Phase(1, crop=32, batch=1),)
-    assert len(parse_phases(train.DEFAULT_PHASES)) == 2
+def weights_of(folder: Path) -> dict[str, torch.Tensor]:
+    return load_model(folder / "weights.safetensors").state_dict()
 
 
-@pytest.mark.parametrize(
-    "text", ["", "4000", "1:2", "1:2:3:4", "1:2:x", "1:2:3,", "0:128:8", "5:-128:8", "5:128:0", "1.5:2:3"]
-)
-def test_other_phases_are_refused_with_an_example(text: str) -> None:
-    with pytest.raises(ValueError, match="give for example") as caught:
-        parse_phases(text)
-    assert repr(text) in str(caught.value)
-    assert train.DEFAULT_PHASES in str(caught.value)
+def flat(value: Any, name: str = "") -> dict[str, Any]:
+    """Return every leaf of a state by its path."""
+    if isinstance(value, list | tuple):
+        value = dict(enumerate(value))
+    if not isinstance(value, dict):
+        return {name: value}
+    return {k: v for key, item in value.items() for k, v in flat(item, f"{name}.{key}").items()}
+
+
+def assert_same_training(first: Path, second: Path) -> None:
+    """Compare shipped weights and full states, but for the seconds they took."""
+    ours, theirs = weights_of(first), weights_of(second)
+    assert all(torch.equal(theirs[name], value) for name, value in ours.items())
+    states = [flat(torch.load(folder / STATE, weights_only=True)) for folder in (first, second)]
+    assert states[0].keys() == states[1].keys()
+    for name in states[0].keys() - {".seconds"}:
+        a, b = (state[name] for state in states)
+        assert torch.equal(a, b) if isinstance(a, torch.Tensor) else a == b, name
 
 
 # Batches
 
 
-def test_a_batch_is_photos_of_the_materials_that_are_its_truth(pool: Path) -> None:
+def test_a_batch_is_photos_of_the_materials_that_are_its_truth(pool: Path, pairs: Path) -> None:
     plain = FlashPhotography(exposure_share=0.0, falloff_share=0.0, noise_range=(0.0, 0.0))
-    batch = batch_source(MaterialPool(pool), AUGMENTATION, plain, POOL_SHARES)(3, 32, seeded(1))
-    assert batch.photo.shape == (3, 3, 32, 32)
-    assert batch.truth.validate().size == (32, 32)
+    materials = PoolMaterials(MaterialPool(pool), SHARES)
+    batch = batch_source(materials, Augmentation(), plain)(3, 16, seeded(1))
+    assert batch.photo.shape == (3, 3, 16, 16)
+    assert batch.truth.validate().size == (16, 16)
     assert batch.light.position.shape == (3, 3)
     assert float(batch.light.position[:, 2].min()) > 0.0
     rendered = render(batch.truth, batch.light, plain.camera).clamp(0.0, 1.0)
     assert_close(batch.photo ** (1 / 2.2), rendered ** (1 / 2.2), atol=0.5 / 255 + 1e-3, rtol=0.0)
+    assert batch.pairs is None
+    both = batch_source(materials, Augmentation(), plain, PhotoPairs(pairs, crop=16), 2)(3, 16, seeded(1))
+    assert torch.equal(both.photo, batch.photo)
+    assert both.pairs is not None
+    assert both.pairs.a.shape == both.pairs.b.shape == (2, 3, 16, 16)
 
 
-def test_the_same_generator_gives_the_same_batch(pool: Path) -> None:
-    source = batch_source(MaterialPool(pool))
-    first, again, other = (source(2, 32, seeded(seed)) for seed in (1, 1, 2))
+def test_the_same_generator_gives_the_same_batch(pool: Path, pairs: Path) -> None:
+    source = batch_source(PoolMaterials(MaterialPool(pool)), pairs=PhotoPairs(pairs, crop=16), pair_count=2)
+    first, again, other = (source(2, 16, seeded(seed)) for seed in (1, 1, 2))
     assert torch.equal(first.photo, again.photo)
     assert torch.equal(first.truth.channels(), again.truth.channels())
     assert torch.equal(first.light.position, again.light.position)
+    assert first.pairs is not None
+    assert again.pairs is not None
+    assert torch.equal(first.pairs.a, again.pairs.a)
+    assert torch.equal(first.pairs.b, again.pairs.b)
     assert not torch.equal(first.photo, other.photo)
 
 
@@ -143,10 +170,8 @@ def test_shares_of_what_the_pool_lacks_are_left_out(
                 counted[kind] += int((drawn == self[position]).all(dim=3).all(dim=2).all(dim=1).sum())
             return drawn[: arguments[0]]
 
-    source = batch_source(
-        Watched(write_pool(tmp_path / "pool", *entries)), Augmentation.none(), shares=POOL_SHARES
-    )
-    source(1, 32, seeded(0))
+    opened = Watched(write_pool(tmp_path / "pool", entries, size=8))
+    batch_source(PoolMaterials(opened, SHARES), Augmentation.none())(1, 8, seeded(0))
     assert sum(counted.values()) == draws
     found = {kind: count / draws for kind, count in counted.items()}
     assert found == pytest.approx(expected, abs=0.08)
@@ -155,82 +180,209 @@ def test_shares_of_what_the_pool_lacks_are_left_out(
 # The command
 
 
-def test_a_training_from_pool_to_material(command: Callable[..., tuple[int, str]], tmp_path: Path) -> None:
-    out = tmp_path / "run"
-    arguments = ("--out", out, "--seed", "3", "--save-every", "2", "--data-note", "bricks, Apache-2.0")
-    assert command(*arguments, "--phases", "4:32:2,2:64:1", "--learning-rate", "0.001") == (0, "")
-    assert sorted(path.name for path in out.iterdir()) == ["state.pt", "weights.safetensors"]
+def test_all_stages_from_pool_to_material(command: Command, pairs: Path, tmp_path: Path) -> None:
+    plan = write_plan(
+        tmp_path / "plan.yaml",
+        STAGES["l1"],
+        {**STAGES["syn"], "phases": [{"iterations": 2, "crop": 16, "batch": 1, "shards": 2}]},
+        STAGES["hyb"],
+        shares=SHARES,
+        augmentation={"specular": 0.4},
+        precision="bf16-mixed",
+    )
+    said = command("--config", plan, "--pairs", pairs, "--seed", "3", "--data-note", "bricks, Apache-2.0")
+    assert said == (0, "")
+    for name in ("l1", "syn", "hyb"):
+        folder = tmp_path / "run" / name
+        assert sorted(path.name for path in folder.iterdir()) == [
+            "log.jsonl", "samples.png", STATE, "tensorboard", "weights.safetensors",
+        ]  # fmt: skip
+        assert any((folder / "tensorboard").iterdir())
+        sheet = oiio.ImageBuf(str(folder / "samples.png")).spec()
+        assert (sheet.width, sheet.height) == (6 * 16, 2 * SHEET_MATERIALS * 16)
 
-    record = read_record(out / "weights.safetensors")
-    assert record.architecture == GeneratorConfig(2, 5, 2)
+    record = read_record(tmp_path / "run" / "syn" / "weights.safetensors")
+    assert record.architecture == GeneratorConfig(**GENERATOR)
     assert record.data == ["bricks, Apache-2.0"]
     training = record.training
-    assert (training["iterations"], training["samples"], training["processes"]) == (6, 10, 1)
-    assert training["config"]["phases"][1] == {"iterations": 2, "crop": 64, "batch": 1}
-    assert training["config"]["learning_rate"] == 0.001
+    assert (training["iterations"], training["samples"], training["processes"]) == (2, 4, 1)
+    assert training["stage"] == "syn"
+    assert training["config"]["phases"] == [{"iterations": 2, "crop": 16, "batch": 1, "shards": 2}]
     assert training["config"]["seed"] == 3
-    assert training["shares"] == POOL_SHARES
-    assert training["augmentation"]["specular"] == AUGMENTATION.specular
-    assert training["objective"]["map_weight"] == 1.0
+    assert training["shares"] == SHARES
+    assert training["augmentation"]["specular"] == 0.4
+    assert training["objective"]["maps"]["l1"] == 10.0
     assert training["photography"]["centred_share"] == FlashPhotography().centred_share
+    assert training["precision"] == "bf16-mixed"
     json.dumps(training, allow_nan=False)
 
-    network = load_model(out / "weights.safetensors")
-    refined = Refiner(network).fit(torch.rand(3, 32, 32, generator=seeded(0)) * 0.5, iters=2)
+    validation = lines_of(tmp_path / "run" / "hyb")[-1]["validation"]
+    judged = {*MAPS, "rendering", "real"}
+    assert {f"{name} accuracy" for name in judged} <= set(validation)
+    assert {"loss", "light", *judged} <= set(validation)
+    assert all(math.isfinite(value) for value in validation.values())
+    assert all(0.0 <= validation[f"{name} accuracy"] <= 1.0 for name in judged)
+
+    network = load_model(tmp_path / "run" / "hyb" / "weights.safetensors")
+    refined = Refiner(network).fit(torch.rand(3, 16, 16, generator=seeded(0)) * 0.5, iters=2)
     refined.svbrdf.validate()
 
 
+def test_a_training_on_strips_names_the_bad_ones(command: Command, strips: Path, tmp_path: Path) -> None:
+    folder = shutil.copytree(strips, tmp_path / "strips")
+    whole = (folder / "000.png").read_bytes()
+    (folder / "broken.png").write_bytes(whole[:-30])
+    plan = write_plan(tmp_path / "plan.yaml", STAGES["syn"])
+    code, said = command("--config", plan, data=folder)
+    assert code == 0
+    assert said == f"refine-train: skipped: {folder / 'broken.png'} is truncated\n"
+    assert read_record(tmp_path / "run" / "syn" / "weights.safetensors").training["iterations"] == 4
+
+
+def test_a_stage_starts_from_the_networks_of_the_one_before(command: Command, tmp_path: Path) -> None:
+    phases = [{"iterations": 1, "crop": 16, "batch": 1}]
+    still = {
+        **STAGES["syn"],
+        "phases": phases,
+        "trainer": {"learning_rate": 1e-12, "final_learning_rate": 0.0},
+    }
+    plan = write_plan(tmp_path / "plan.yaml", STAGES["l1"], still)
+    assert command("--config", plan) == (0, "")
+    first, second = (torch.load(tmp_path / "run" / n / STATE, weights_only=True) for n in ("l1", "syn"))
+    assert second["iteration"] == 1
+    for name, value in first["network"].items():
+        assert_close(second["network"][name], value, atol=1e-6)
+
+    # The same, one stage after the other, and from a state of elsewhere.
+    assert command("--config", plan, "--stage", "l1", out="apart") == (0, "")
+    assert command("--config", plan, "--stage", "syn", out="apart") == (0, "")
+    assert_same_training(tmp_path / "run" / "syn", tmp_path / "apart" / "syn")
+    start = ("--start", tmp_path / "apart" / "l1" / STATE)
+    assert command("--config", plan, "--stage", "syn", *start, out="elsewhere") == (0, "")
+    assert_same_training(tmp_path / "run" / "syn", tmp_path / "elsewhere" / "syn")
+
+
 def test_resuming_goes_on_where_it_stopped(
-    command: Callable[..., tuple[int, str]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    command: Command, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    whole, parts = tmp_path / "whole", tmp_path / "parts"
-    phases = ("--phases", "6:32:2")
-    assert command("--out", whole, *phases, "--save-every", "3")[0] == 0
+    stages = ({**STAGES["l1"], "phases": [{"iterations": 2, "crop": 8, "batch": 1}]}, STAGES["syn"])
+    plan = ("--config", write_plan(tmp_path / "plan.yaml", *stages), "--save-every", "3")
+    assert command(*plan, out="whole")[0] == 0
 
     step, steps = train.Trainer.step, []
 
     def interrupted(self: train.Trainer) -> dict[str, float]:
-        steps.append(self.iteration)
-        if len(steps) == 5:
+        steps.append((self.config.iterations, self.iteration))
+        if len(steps) == 6:
             raise KeyboardInterrupt
         return step(self)
 
     monkeypatch.setattr(train.Trainer, "step", interrupted)
-    assert command("--out", parts, *phases, "--save-every", "3")[0] != 0
-    assert read_record(parts / "weights.safetensors").training["iterations"] == 3
-    assert command("--out", parts, *phases, "--save-every", "3", "--resume")[0] == 0
-    assert steps == [0, 1, 2, 3, 4, 3, 4, 5]  # the fifth was lost, the first three were kept
-    first, second = (load_model(folder / "weights.safetensors") for folder in (whole, parts))
-    for name, value in first.state_dict().items():
-        assert torch.equal(second.state_dict()[name], value), name
-    assert read_record(parts / "weights.safetensors").training["iterations"] == 6
+    assert command(*plan, out="parts")[0] != 0
+    assert read_record(tmp_path / "parts" / "syn" / "weights.safetensors").training["iterations"] == 3
+    assert command(*plan, "--resume", out="parts")[0] == 0
+    assert steps == [(2, 0), (2, 1), (4, 0), (4, 1), (4, 2), (4, 3), (4, 3)]
+    for name in ("l1", "syn"):
+        assert_same_training(tmp_path / "whole" / name, tmp_path / "parts" / name)
+
+
+def test_steps_stop_a_training_as_if_interrupted(command: Command, tmp_path: Path) -> None:
+    plan = ("--config", write_plan(tmp_path / "plan.yaml", STAGES["l1"], STAGES["syn"]))
+    assert command(*plan, out="whole") == (0, "")
+    assert command(*plan, "--steps", "3", out="parts") == (0, "")
+    assert not (tmp_path / "parts" / "syn").exists()
+    for count in (3, 1):
+        assert command(*plan, "--steps", str(count), "--resume", out="parts") == (0, "")
+    done = {name: torch.load(tmp_path / "parts" / name / STATE, weights_only=True) for name in ("l1", "syn")}
+    assert [done[name]["iteration"] for name in ("l1", "syn")] == [4, 3]
+    assert command(*plan, "--resume", out="parts") == (0, "")
+    assert_same_training(tmp_path / "whole" / "syn", tmp_path / "parts" / "syn")
 
 
 def test_the_log_has_a_line_of_json_now_and_then(
-    command: Callable[..., tuple[int, str]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    command: Command, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(train, "LOG_EVERY", 2)
-    assert command("--out", tmp_path / "run", "--phases", "5:32:1")[0] == 0
-    lines = [json.loads(line) for line in (tmp_path / "run" / "log.jsonl").read_text().splitlines()]
-    assert [line["iteration"] for line in lines] == [2, 4]
-    assert {"loss", "normal", "diffuse", "roughness", "specular", "rendering", "light"} <= set(lines[0])
+    plan = write_plan(tmp_path / "plan.yaml", STAGES["syn"])
+    assert command("--config", plan, "--save-every", "3")[0] == 0
+    lines = lines_of(tmp_path / "run" / "syn")
+    assert [(line["iteration"], "validation" in line) for line in lines] == [
+        (2, False), (3, True), (4, False), (4, True),
+    ]  # fmt: skip
+    assert {"loss", "critics", *MAPS, "rendering", "light", "rendering accuracy"} <= set(lines[0])
     assert lines[0]["samples_per_second"] > 0.0
 
 
+def test_held_out_figures_are_the_same_at_every_call(
+    command: Command, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    figures, validate = [], train.Watch.validate
+
+    def twice(self: train.Watch, trainer: train.Trainer) -> dict[str, float]:
+        figures.extend([validate(self, trainer), validate(self, trainer)])
+        return figures[-1]
+
+    monkeypatch.setattr(train.Watch, "validate", twice)
+    plan = write_plan(tmp_path / "plan.yaml", STAGES["syn"])
+    assert command("--config", plan, "--save-every", "2") == (0, "")
+    assert figures[0] == figures[1] != figures[2] == figures[3]
+
+
+def test_a_disk_that_fills_up_leaves_the_last_state(
+    command: Command, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    plan = ("--config", write_plan(tmp_path / "plan.yaml", STAGES["l1"]), "--save-every", "2")
+    save, saves = torch.save, []
+
+    def full(state: Any, path: Path) -> None:
+        saves.append(path)
+        if len(saves) == 2:
+            path.write_bytes(b"half a state")
+            raise RuntimeError("PytorchStreamWriter failed writing file data/7: file write failed")
+        save(state, path)
+
+    monkeypatch.setattr(torch, "save", full)
+    code, said = command(*plan)
+    assert code == 2
+    assert said.startswith("refine-train: ")
+    assert "state.pt cannot be written (PytorchStreamWriter failed" in said
+    assert said.count("\n") == 1
+    assert torch.load(tmp_path / "run" / "l1" / STATE, weights_only=True)["iteration"] == 2
+    assert command(*plan, "--resume") == (0, "")
+    monkeypatch.undo()
+    assert command(*plan, out="whole") == (0, "")
+    assert_same_training(tmp_path / "run" / "l1", tmp_path / "whole" / "l1")
+
+
+# Mistakes
+
+VGG_STAGE = {**STAGES["syn"], "objective": {"kind": "synthetic"}}
+WIDE = {"width": 3, "levels": 3, "deep_multiplier": 2}
+
+
 @pytest.mark.parametrize(
-    ("arguments", "hint"),
+    ("stages", "arguments", "hint"),
     [
-        (("--phases", "soup"), "'soup' is not iterations:crop:batch"),
-        (("--phases", "6:0:2"), "'6:0:2' is not iterations:crop:batch"),
-        (("--phases", "6:40:2"), "multiples of 32"),
-        (("--width", "0"), "not a generator"),
-        (("--levels", "40"), "not a generator"),
+        (["syn"], ("--stage", "soup"), "--stage soup is not in the plan; it has syn"),
+        (["hyb"], (), "a stage trains on real pairs; give their folder with --pairs"),
+        (["hyb"], ("--pairs", "absent"), "absent is not a folder"),
+        (["syn"], ("--start", "absent.pt"), "--start absent.pt is not a file"),
+        (["l1", "syn"], ("--stage", "syn"), "stage syn starts from the networks of l1, but there is no"),
+        (
+            ["syn"],
+            ("--devices", "2"),
+            "stage syn has phases of 1 shards, which do not divide among 2 processes",
+        ),
+        (["syn"], ("--accelerator", "soup"), "cannot train on 1 soup devices: "),
+        (["vgg"], ("--vgg", "absent.safetensors"), "run `python -m losses.fetch_weights vgg`"),
     ],
 )
 def test_mistakes_end_in_one_sentence(
-    arguments: tuple[str, ...], hint: str, command: Callable[..., tuple[int, str]], tmp_path: Path
+    stages: list[str], arguments: tuple[str, ...], hint: str, command: Command, tmp_path: Path
 ) -> None:
-    code, said = command("--out", tmp_path / "run", *arguments)
+    known = {**STAGES, "vgg": VGG_STAGE}
+    plan = write_plan(tmp_path / "plan.yaml", *(known[name] for name in stages))
+    code, said = command("--config", plan, *arguments)
     assert code == 2
     assert said.startswith("refine-train: ")
     assert hint in said
@@ -238,9 +390,60 @@ def test_mistakes_end_in_one_sentence(
     assert not (tmp_path / "run").exists()
 
 
-def test_a_pool_that_is_none_is_named(command: Callable[..., tuple[int, str]], tmp_path: Path) -> None:
-    code, said = command("--out", tmp_path / "run", "--phases", "2:32:1", pool=tmp_path / "absent")
+def test_plans_and_data_that_are_none_are_named(command: Command, tmp_path: Path) -> None:
+    plan = write_plan(tmp_path / "plan.yaml", STAGES["l1"])
+    (tmp_path / "index.json").write_text("{}")
+    for arguments, data, hint in (
+        (("--config", tmp_path / "no.yaml"), tmp_path, "no.yaml cannot be read"),
+        (("--config", plan), tmp_path / "absent", "absent is not a folder"),
+        (("--config", plan), tmp_path, "is not a complete material pool"),
+    ):
+        code, said = command(*arguments, data=data)
+        assert (code, said.count("\n")) == (2, 1)
+        assert hint in said
+        assert not (tmp_path / "run").exists()
+
+
+def test_without_vgg_the_command_that_fetches_it_is_named(
+    command: Command, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for variable in ("XDG_CACHE_HOME", "TORCH_HOME", "HOME"):
+        monkeypatch.setenv(variable, str(tmp_path / "empty"))
+    monkeypatch.delenv("REFINE_VGG16", raising=False)
+    code, said = command("--config", write_plan(tmp_path / "plan.yaml", VGG_STAGE))
     assert code == 2
+    assert "run `python -m losses.fetch_weights vgg` once" in said
     assert said.count("\n") == 1
-    assert "absent is not a complete material pool" in said
     assert not (tmp_path / "run").exists()
+
+
+def test_no_training_is_overwritten_or_continued_as_another(command: Command, tmp_path: Path) -> None:
+    plan = write_plan(tmp_path / "plan.yaml", STAGES["l1"])
+    assert command("--config", plan) == (0, "")
+    before = (tmp_path / "run" / "l1" / STATE).read_bytes()
+    code, said = command("--config", plan)
+    assert (code, said.count("\n")) == (2, 1)
+    assert "holds a training already; go on with --resume or give another --out" in said
+    write_plan(plan, STAGES["l1"], generator=WIDE)
+    code, said = command("--config", plan, "--resume")
+    assert (code, said.count("\n")) == (2, 1)
+    assert "is the state of another network or objective" in said
+    (tmp_path / "run" / "l1" / STATE).write_bytes(before[:1000])
+    code, said = command("--config", plan, "--resume")
+    assert (code, said.count("\n")) == (2, 1)
+    assert "is not the state of a training" in said
+    (tmp_path / "run" / "l1" / STATE).write_bytes(before)
+    write_plan(plan, STAGES["l1"])
+    assert command("--config", plan, "--resume") == (0, "")
+
+
+def test_the_sheet_shows_truth_above_estimate(command: Command, tmp_path: Path) -> None:
+    plan = write_plan(tmp_path / "plan.yaml", STAGES["l1"])
+    assert command("--config", plan, "--steps", "1") == (0, "")
+    sheet = oiio.ImageBuf(str(tmp_path / "run" / "l1" / "samples.png")).get_pixels(oiio.FLOAT)
+    rows = sheet.reshape(2 * SHEET_MATERIALS, 16, 6, 16, 3).transpose(0, 2, 1, 3, 4)
+    for truth, estimate in zip(rows[0::2], rows[1::2], strict=True):
+        assert np.array_equal(truth[0], estimate[0])  # the photo
+        assert all(np.abs(truth[n] - estimate[n]).mean() > 0.01 for n in range(1, 6))
+    photos = [row[0] for row in rows[0::2]]
+    assert not np.array_equal(photos[0], photos[1])
