@@ -37,7 +37,7 @@ from nets.data.procedural.noise import (
     strokes,
     unit,
 )
-from nets.data.procedural.relief import box, hexagons, scales, shoulder, softened
+from nets.data.procedural.relief import box, hexagons, padded, scales, shoulder, softened
 
 _STONE = ("#8b857b", "#6f6c68", "#a59a86", "#5d5a57", "#b8ab94", "#7d7263", "#9a8f8a", "#6a6f74", "#8f6f5f")
 _SOIL = ("#4a4036", "#6b5d4a", "#8a7d68", "#3a352f", "#9a9488", "#58503f")
@@ -79,14 +79,15 @@ def _stones(
     bevel = reach * log_uniform(rng, *roundness)
     shoulders = softened(shoulder(gnawed, bevel, rng.uniform(38, 58), rng.uniform(1.3, 2.6)), 0.006)
     crown = shoulder(gnawed, 1.1 * reach, rng.uniform(2, 25), 2.0)
+    crown = padded(shoulders + crown, gnawed, 0.2 * reach)
     split = float(rng.random() < 0.4)  # riven with a hammer, or worn smooth
     facets = scattered(rng, np.abs(spectral(rng, size, 3, slope=1.8)), index)
     face = smoothstep(0, 0.35 * bevel, gnawed)
-    tilt = lean(rng, index, u, v, rng.uniform(0.02, 0.1)) + pick(rng, index, -0.12, 0.12) * reach
+    tilt = lean(rng, index, u, v, rng.uniform(0.02, 0.1)) + pick(rng, index, -0.06, 0.06) * reach
     texture = tilted(body + 0.5 * rough, rng.uniform(2, 6)) + split * tilted(facets, rng.uniform(4, 9))
     filling, grit = _joint(rng, size)
-    fill = rng.uniform(0.0, 0.55) * float(shoulders.max())  # how high the joints are filled
-    stones = shoulders + crown + face * (tilt + texture)
+    fill = rng.uniform(0.0, 0.45) * float(shoulders.max())  # how high the joints are filled
+    stones = crown + face * (tilt + texture)
     height = np.maximum(stones, fill + grit)
     buried = smoothstep(-0.2 * bevel, 0.25 * bevel, fill + grit - stones)
 
@@ -121,7 +122,7 @@ def setts(rng: np.random.Generator, size: int) -> MaterialMaps:
     width = log_uniform(rng, 0.17, 0.5)
     if rng.random() < 0.3:  # segmental arcs
         span = width * rng.uniform(6, 10)
-        y = y - np.float32(rng.uniform(0.1, 0.22) * span) * np.abs(np.sin(np.pi * x / span))
+        y = y - np.float32(rng.uniform(0.06, 0.13) * span) * np.abs(np.sin(np.pi * x / span))
     ratio = rng.choice([1.0, rng.uniform(1.0, 2.0)])
     if rng.random() < 0.2:
         ratio = 2.0
@@ -186,12 +187,13 @@ def _glazed(
     cushion = width * log_uniform(rng, 0.05, 0.35)
     pillow = shoulder(outline, cushion, rng.uniform(20, 55), rng.uniform(1.6, 3.0))
     domed = shoulder(outline, 0.5 * width, rng.uniform(0, 14), 2.0)
+    pillow = padded(pillow + domed, outline, width * rng.uniform(0.01, 0.08))
     face = smoothstep(0, 0.018, outline)
     askew = lean(rng, index, u, v, 0.09 * hand) + pick(rng, index, 0, 0.02 * width * hand)
     wavy = hand * (tilted(body, rng.uniform(1, 4)) + tilted(ripple, rng.uniform(0.5, 4)))
     grout_relief = tilted(spectral(rng, size, 30, slope=0.8), rng.uniform(4, 9))
     grout_level = rng.uniform(0.0, 0.4) * float(pillow.max())
-    height = lerp(grout_level + grout_relief, pillow + domed + askew + wavy, face)
+    height = lerp(grout_level + grout_relief, pillow + askew + wavy, face)
 
     colour = blend(dye(rng), dye(rng), (pick(rng, index) < rng.choice([0.0, 0.0, 0.3])).astype(np.float32))
     colour = shade(colour, np.exp(rng.uniform(0.03, 0.35) * pick(rng, index, -1, 1)))

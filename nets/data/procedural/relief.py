@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import ndimage
 
-from nets.data.procedural.noise import Field, Index, Real
+from nets.data.procedural.noise import Field, Index, Real, smoothstep
 
 
 @dataclass(frozen=True)
@@ -140,6 +140,14 @@ def rubbed(height: Real, level: Real | float, softness: float) -> Field:
 def softened(height: Real, width: float) -> Field:
     """The height with its sharp corners rounded over `width` surface units."""
     return np.asarray(ndimage.gaussian_filter(height, width * height.shape[0] / 2), dtype=np.float32)
+
+
+def padded(height: Real, distance: Real, width: float) -> Field:
+    """The height with mitred ridges rounded over `width`, but only that far inside the outline or further."""
+    soft = softened(height, width)
+    return np.asarray(
+        height + (soft - height) * smoothstep(0.3 * width, 2 * width, distance), dtype=np.float32
+    )
 
 
 def runs(source: Real, length: float) -> Field:

@@ -30,7 +30,7 @@ from nets.data.procedural.noise import (
     strokes,
     unit,
 )
-from nets.data.procedural.relief import hexagons, lattice, shoulder, softened, swell
+from nets.data.procedural.relief import hexagons, lattice, padded, shoulder, softened, swell
 
 _HIDE = ("#5a3a26", "#2b211c", "#8a5a36", "#a87b52", "#6b2f25", "#1c1b1b", "#c9b79a", "#3c2a22")
 
@@ -145,6 +145,7 @@ def quilted_leather(rng: np.random.Generator, size: int) -> MaterialMaps:
     seam, along = _seams(rng, size, pitch)
     puff = pitch * rng.uniform(0.25, 0.5)
     padding = shoulder(seam, puff, rng.uniform(22, 55), rng.uniform(1.6, 3.0))
+    padding = padded(padding, seam, rng.uniform(0.05, 0.12) * pitch)
     gather = spectral(rng, size, 12, 60, slope=1.0)
     near = np.exp(-seam / (0.16 * pitch)) * smoothstep(0, 0.02, seam)
     padding = padding + near * rng.uniform(0, 0.008) * gather
