@@ -10,7 +10,7 @@ import json
 import logging
 import math
 import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from importlib import import_module
 from pathlib import Path
@@ -69,7 +69,7 @@ def _version(asked: bool) -> bool:
 def fit(
     photo: Annotated[Path, typer.Argument(metavar="PHOTO", help="JPEG, PNG, TIFF, EXR", show_default=False)],
     light: Annotated[str, _surface("X,Y,Z", "Position of the flash (estimated)")] = "estimated",
-    falloff: Annotated[str, _surface("NAME", "(none), inverse_square")] = "none",
+    falloff: Annotated[str, _surface("NAME", "(none), inverse_square, auto")] = "none",
     camera: Annotated[
         str, _surface("NAME", "(perspective), orthographic, collocated, X,Y,Z")
     ] = "perspective",
@@ -109,7 +109,9 @@ def fit(
         else parse_point("--light", light, "or leave it out to have it estimated")
     )
     kind, viewpoint = parse_camera(camera)
-    _choose("--falloff", falloff, ("none", "inverse_square"))
+    _choose("--falloff", falloff, ("none", "inverse_square", "auto"))
+    if falloff == "auto" and position is not None:
+        raise UserError("--falloff auto needs a light to fit; leave out --light or name the falloff.")
     _choose("--normals", normals, ("opengl", "directx"))
     for name, number, lowest in (("iters", iters, 0), ("resolution", resolution, 0), ("threads", threads, 1)):
         if number is not None and not lowest <= number < 2**31:
@@ -124,6 +126,7 @@ def fit(
 
     from nets.render import Camera, PointLight
     from refine.engine import ENGINES
+    from refine.light import FalloffChoice
     from refine.photo import ColorSpaceChoice, read_photo
     from refine.refiner import Refiner
     from refine.result import MAP_FORMATS, Output, describe, describe_checkpoint, write_result
@@ -163,8 +166,6 @@ def fit(
     flash: PointLight | None = None
     if position is not None:
         flash = PointLight.at(position, falloff=cast(Literal["none", "inverse_square"], falloff)).to(device)
-    elif falloff != "none":
-        refiner.model = _with_falloff(refiner.model, cast(Literal["none", "inverse_square"], falloff))
 
     settings = {
         "init": init,
@@ -183,7 +184,13 @@ def fit(
         "threads": torch.get_num_threads(),
     }
     with progress_bar(shown=not quiet and sys.stderr.isatty()) as progress, _enough_memory():
-        refined = refiner.fit(read, light=flash, iters=iters, progress=progress)
+        refined = refiner.fit(
+            read,
+            light=flash,
+            falloff=None if flash else cast(FalloffChoice, falloff),
+            iters=iters,
+            progress=progress,
+        )
         record = describe(refined, output, settings=settings, checkpoint=checkpoint, photo=read)
         paths = write_result(refined, output, record)
     if as_json:
@@ -241,21 +248,6 @@ def _require_device(name: str) -> None:
         torch.zeros(1, device=name).item()
     except (RuntimeError, AssertionError, NotImplementedError, ImportError):
         raise UserError(f"--device {name!r} is not there on this machine; use --device cpu.") from None
-
-
-def _with_falloff(model: Any, falloff: Literal["none", "inverse_square"]) -> Callable[[Any], Any]:
-    # The same model, whose light falls off as the user says; networks do not predict that.
-    from dataclasses import replace
-
-    from nets.ensemble import Predictor
-
-    predict = model.predict if isinstance(model, Predictor) else model
-
-    def changed(photo: Any) -> Any:
-        svbrdf, light = predict(photo)
-        return svbrdf, replace(light, falloff=falloff)
-
-    return changed
 
 
 @contextmanager

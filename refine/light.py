@@ -7,7 +7,8 @@ because the material does not explain it well enough, stays as the light head sa
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Literal
 
 import numpy as np
 import torch
@@ -17,6 +18,11 @@ from nets.color import gamma_encode
 from nets.render import PointLight, shade, shading_geometry, surface_points
 from nets.svbrdf import SVBRDF
 from refine.capture import Capture
+
+FALLOFFS: tuple[Literal["none", "inverse_square"], ...] = ("none", "inverse_square")
+
+FalloffChoice = Literal["none", "inverse_square", "auto"] | None
+"""How a light whose position is not known falls off; None: as the model says."""
 
 NORMAL_CONSISTENCY = 1.4826
 """Standard deviation of a normal distribution over its median absolute deviation."""
@@ -73,7 +79,9 @@ class LightFit:
         )
 
 
-def fit_light(svbrdf: SVBRDF, guess: PointLight, capture: Capture, settings: LightFit) -> PointLight:
+def fit_light(
+    svbrdf: SVBRDF, guess: PointLight, capture: Capture, settings: LightFit, falloff: FalloffChoice = None
+) -> PointLight:
     """Fit the light's position to the photo, from a guess.
 
     Two passes of the same robust least squares (scipy, trust region reflective). The first nearly ignores the
@@ -82,13 +90,23 @@ def fit_light(svbrdf: SVBRDF, guess: PointLight, capture: Capture, settings: Lig
 
     Args:
         svbrdf: the initialization, at the photo's size.
-        guess: the light head's estimate; intensity and falloff are kept.
+        guess: the light head's estimate; its intensity is kept.
         capture: the photo and camera.
         settings: see `LightFit`.
+        falloff: of the light; `auto` fits with and without and keeps what explains the photo better, None
+            keeps the guess's.
 
     Returns:
         The light with the fitted position, float32.
     """
+    if falloff != "auto":
+        return _fit(svbrdf, replace(guess, falloff=falloff or guess.falloff), capture, settings)[0]
+    fits = [_fit(svbrdf, replace(guess, falloff=name), capture, settings) for name in FALLOFFS]
+    return min(fits, key=lambda fit: fit[1])[0]
+
+
+def _fit(svbrdf: SVBRDF, guess: PointLight, capture: Capture, settings: LightFit) -> tuple[PointLight, float]:
+    """Return the fitted light, and the robust misfit it leaves."""
     stride = max(1, max(svbrdf.size) // settings.samples)
     pixels = (..., slice(stride // 2, None, stride), slice(stride // 2, None, stride))
     material = svbrdf.map(lambda tensor: tensor[pixels].double().cpu())
@@ -115,6 +133,10 @@ def fit_light(svbrdf: SVBRDF, guess: PointLight, capture: Capture, settings: Lig
         )
         return torch.where(unsaturated, rendering - target, (target - rendering).relu()).numpy().ravel()
 
+    def misfit_of(unknowns: np.ndarray) -> float:
+        scaled = differences(unknowns) / settings.residual_scale
+        return float(np.mean(np.sqrt(1.0 + scaled**2) - 1.0))
+
     def solve(prior: float) -> np.ndarray:  # [6]
         weights = prior * np.sqrt(target.numel()) / settings.widths
         solution = least_squares(
@@ -130,5 +152,6 @@ def fit_light(svbrdf: SVBRDF, guess: PointLight, capture: Capture, settings: Lig
 
     loose = solve(settings.loose_prior * settings.residual_scale)
     misfit = NORMAL_CONSISTENCY * float(np.median(np.abs(differences(loose))))
-    fitted = light_at(solve(settings.prior * misfit))
-    return PointLight(fitted.position.float(), guess.intensity.float().cpu(), guess.falloff)
+    solution = solve(settings.prior * misfit)
+    position = light_at(solution).position.float()
+    return PointLight(position, guess.intensity.float().cpu(), guess.falloff), misfit_of(solution)

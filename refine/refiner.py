@@ -20,7 +20,7 @@ from nets.svbrdf import SVBRDF
 from refine.capture import Capture
 from refine.engine import choose_engine, find_descend
 from refine.initialization import Predict, Predictor, initialize
-from refine.light import fit_light
+from refine.light import FALLOFFS, FalloffChoice, fit_light
 from refine.maps import MapFormat, NormalConvention, write_maps
 from refine.parametrization import Parameters
 from refine.photo import ColorSpaceChoice, Photo, photo_from_array, read_photo, resize_photo
@@ -145,6 +145,7 @@ class Refiner:
         img: str | Path | Photo | np.ndarray | Tensor,
         *,
         light: PointLight | None = None,
+        falloff: FalloffChoice = None,
         iters: int | None = None,
         color_space: ColorSpaceChoice = "auto",
         progress: Report | None = None,
@@ -155,6 +156,8 @@ class Refiner:
             img: a file, an array `[H, W, C]` or a tensor `[3, H, W]`; see `refine.photo` for how values
                 become linear light.
             light: the flash, if known; otherwise the light head's estimate, fitted to the photo.
+            falloff: of a light that is not known: `none` (the paper's), `inverse_square` (a real flash's),
+                or `auto`, which keeps what explains the photo better; None is what the model says.
             iters: steps of all stages together; None takes the recipe's, 0 returns the initialization.
             color_space: how `img` is encoded.
             progress: called after every iteration.
@@ -177,11 +180,13 @@ class Refiner:
 
         clock = time.perf_counter()
         initial, guess = initialize(self.model, capture.photo)
+        if falloff in FALLOFFS:
+            guess = replace(guess, falloff=falloff)
         seconds["initialization"] = time.perf_counter() - clock
 
         if light is None and recipe.light_fit is not None and recipe.iterations > 0:
             clock = time.perf_counter()
-            light = fit_light(initial, guess, capture, recipe.light_fit).to(self.device)
+            light = fit_light(initial, guess, capture, recipe.light_fit, falloff).to(self.device)
             seconds["light"] = time.perf_counter() - clock
         light = light or guess
         svbrdf, losses = run_stages(initial, light, capture, recipe, seconds, progress, self.engine)

@@ -361,6 +361,7 @@ def over_the_photo(folder: Path, photo: Path) -> list[str]:
         (bad_arguments("--light", "0,0,-2"), "in front of the surface"),
         (bad_arguments("--camera", "fisheye"), "collocated"),
         (bad_arguments("--falloff", "linear"), "inverse_square"),
+        (bad_arguments("--light", "0,0,2", "--falloff", "auto"), "leave out --light"),
         (bad_arguments("--color-space", "rec2020"), "display-p3"),
         (bad_arguments("--normals", "vulkan"), "directx"),
         (bad_arguments("--recipe", "soup"), "paper"),

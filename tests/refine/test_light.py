@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 import pytest
@@ -28,6 +30,7 @@ WRONG_BY = 0.15
 
 Model = Callable[[Tensor], tuple[SVBRDF, PointLight]]
 Position = tuple[float, float, float]
+FallOff = Literal["none", "inverse_square"]
 
 PLAIN = {
     "plain gloss": SVBRDF.constant(SIZE, SIZE, diffuse=0.3, roughness=0.3, specular=0.05),
@@ -106,6 +109,27 @@ def test_falloff_and_intensity_are_the_guess_s(tmp_path: Path) -> None:
     assert found.falloff == "inverse_square"
     assert torch.equal(found.intensity, guess.intensity)
     assert found.position.dtype == torch.float32
+
+
+@pytest.mark.parametrize("truly", ["none", "inverse_square"])
+@pytest.mark.parametrize("guessed", ["none", "inverse_square"])
+@pytest.mark.parametrize("name", ["plain satin", "leather", "hammered_metal"])
+def test_the_falloff_that_explains_the_photo_is_kept(
+    name: str, guessed: FallOff, truly: FallOff, tmp_path: Path
+) -> None:
+    truth = replace(PointLight.at((0.1, -0.2, 1.6)), falloff=truly)
+    guess = replace(beside((0.1, -0.2, 1.6), (1, -1, 1)), falloff=guessed)
+    photo = saved(tmp_path, material(name), truth)
+    found = Refiner(knows(material(name), guess)).fit(photo, iters=1, falloff="auto").light
+    assert found.falloff == truly
+    assert error(found, truth) < ALLOWED
+
+
+@pytest.mark.parametrize("falloff", ["none", "inverse_square"])
+@pytest.mark.parametrize("iters", [0, 1])
+def test_a_falloff_can_be_said(falloff: FallOff, iters: int, tmp_path: Path) -> None:
+    refined, _ = fitted(tmp_path, iters=iters, falloff=falloff)
+    assert refined.light.falloff == falloff
 
 
 def fitted(tmp_path: Path, **more: object) -> tuple[Refined, PointLight]:
