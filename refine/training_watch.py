@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from nets.color import to_network_input
+from nets.color import gamma_encode
 from nets.data.contact_sheet import panels
 from nets.data.images import write_image
 from nets.svbrdf import SVBRDF
@@ -83,7 +83,7 @@ class Watch:
         estimate, _ = trainer.average.predict(batch.photo)
         rows = []
         for number in range(SHEET_MATERIALS):
-            photo = (to_network_input(batch.photo[number]).permute(1, 2, 0) + 1.0) / 2.0
+            photo = gamma_encode(batch.photo[number]).permute(1, 2, 0)
             for material in (batch.truth, estimate):
                 one = SVBRDF.from_channels(material.channels()[number : number + 1].float().cpu())
                 rows.append(np.concatenate([photo.cpu().numpy(), *panels(one)], axis=1))
