@@ -212,7 +212,7 @@ class Trainer:
             self.average.load_state_dict(state["average"])
             for name, critic in self.critics.items():
                 prefix = f"{name}."
-                known = state["critics"].items()
+                known = state.get("critics", {}).items()  # old states have none
                 own = {k.removeprefix(prefix): v for k, v in known if k.startswith(prefix)}
                 if own:
                     critic.load_state_dict(own)
@@ -224,7 +224,7 @@ class Trainer:
             state = torch.load(path, map_location=self.team.device, weights_only=True)
         except Exception as error:  # torch names no common base of what a damaged file raises
             raise ValueError(f"{path} is not the state of a training ({_first_line(error)})") from None
-        if not isinstance(state, dict) or not {"network", "average", "critics"} <= state.keys():
+        if not isinstance(state, dict) or not {"network", "average"} <= state.keys():
             raise ValueError(f"{path} is not the state of a training")
         return state
 

@@ -347,6 +347,14 @@ def test_a_stage_adopts_networks_and_starts_anew(tmp_path: Path) -> None:
     third = player()
     third.adopt(tmp_path / "plain.pt")  # the critics of the first adversarial stage are new
     assert_same_bits(third.network.state_dict(), plain.network.state_dict())
+    old = torch.load(tmp_path / "plain.pt", weights_only=True)
+    del old["critics"], old["critic_optimizer"]  # as states were before there were critics
+    torch.save(old, tmp_path / "old.pt")
+    fourth = player()
+    fourth.adopt(tmp_path / "old.pt")
+    assert_same_bits(fourth.network.state_dict(), plain.network.state_dict())
+    with pytest.raises(ValueError, match="another network or objective"):
+        fourth.resume(tmp_path / "old.pt")
 
 
 # Shards and teams
@@ -434,7 +442,8 @@ def test_the_gradient_of_a_step_is_the_mean_of_those_of_its_shards() -> None:
     for mean, first, second in zip(found, *gradients, strict=True):
         assert mean is not None
         torch.testing.assert_close(mean, (first + second) / 2.0, rtol=1e-4, atol=1e-7)
-    assert sum(torch.equal(*pair) for pair in zip(*gradients, strict=True)) < 3
+    first, second = (torch.cat([part.flatten() for part in one]) for one in gradients)
+    assert float((first - second).abs().mean()) > 0.1 * float(first.abs().mean())
 
 
 def test_shards_draw_from_streams_of_their_own_wherever_they_are() -> None:
