@@ -27,6 +27,9 @@ from nets.data.strips import read_strip
 from nets.render import PointLight, render
 from nets.svbrdf import SVBRDF
 
+LONGEST_SHEET = 30000
+"""Pixels: image libraries stop at 2^16 a side, and most viewers before."""
+
 COLUMNS = ("rendering", "normal", "diffuse", "roughness", "specular")
 
 LIGHT = PointLight.at((-0.7, 0.7, 2.0), 1.0)
@@ -112,6 +115,32 @@ def draw(materials: Sequence[tuple[str, SVBRDF]], out: Path, *, tile: int = 192)
             if column == 0:
                 axis.text(0.0, -0.01, name, fontsize=6, transform=axis.transAxes, va="top")
     figure.subplots_adjust(0.005, 0.02, 0.995, 1.0 - 0.25 / (rows * (tile + 16) / dpi + 0.2), 0.02, 0.08)
+    figure.savefig(out)
+
+
+def draw_photos(
+    scenes: Sequence[tuple[str, Sequence[Float[np.ndarray, "h w 3"]]]], out: Path, *, tile: int = 112
+) -> None:
+    """Write a sheet of photos of several scenes, one row per scene, labelled.
+
+    Args:
+        scenes: names and photos, encoded for display, in [0, 1].
+        out: a file of any type matplotlib writes.
+        tile: side of a picture in pixels; smaller if there are so many scenes that no file would hold them.
+    """
+    import matplotlib.figure
+
+    rows, columns, dpi = len(scenes), max(len(photos) for _, photos in scenes), 100
+    tile = min(tile, max(16, LONGEST_SHEET // rows - 16))
+    figure = matplotlib.figure.Figure(figsize=(columns * tile / dpi, rows * (tile + 16) / dpi), dpi=dpi)
+    axes = figure.subplots(rows, columns, squeeze=False)
+    for row, (name, photos) in zip(axes, scenes, strict=True):
+        for axis in row:
+            axis.set_axis_off()
+        for axis, photo in zip(row, photos, strict=False):
+            axis.imshow(photo, interpolation="nearest")
+        row[0].text(0.0, 1.02, f"{name}, {len(photos)} photos", fontsize=6, transform=row[0].transAxes)
+    figure.subplots_adjust(0.0, 0.0, 1.0, 1.0 - 14.0 / (rows * (tile + 16)), 0.02, 16.0 / tile)
     figure.savefig(out)
 
 
