@@ -55,8 +55,8 @@ BIWEIGHT = 4.685
 DAMPING = 1e-4
 """Share of the mean curvature added to all: a stripe pattern says nothing of its own direction."""
 
-MINIMUM_CORRELATION = 0.35
-"""Weighted correlation with the mean of all frames below which a frame counts as lost."""
+MINIMUM_CORRELATION = 0.4
+"""Weighted correlation with the mean of other frames below which a frame counts as lost."""
 
 MAXIMUM_DRIFT = 0.004
 """Shares of the longer side by which the two passes may disagree at a corner: else a frame counts as lost."""
@@ -72,7 +72,7 @@ class Stabilization:
 
     Attributes:
         homographies: from normalised coordinates of the first frame to each frame's; the first is identity.
-        correlation: of each registered frame with the mean of all, local contrasts, [-1, 1].
+        correlation: of each registered frame with the mean of the others, local contrasts, [-1, 1].
         reliable: frames that correlate well enough and on which two passes agree.
     """
 
@@ -145,8 +145,8 @@ def stabilize(frames: Sequence[Float[Tensor, "1 1 h w"]]) -> Stabilization:
     """Register every frame to the first, in two passes.
 
     The first pass goes through the frames in order and compares each with the mean of those before it. The
-    second compares all with the mean that the first has left, which holds every light. Where the passes
-    disagree, or a frame looks unlike the mean, registration is not to be trusted.
+    second compares each with the mean of all others, which holds every light. Where the passes disagree, or a
+    frame looks unlike the mean, registration is not to be trusted.
 
     Args:
         frames: encoded luminance in [0, 1], all of one size, at least 64 pixels a side; about 480 pixels are
@@ -159,19 +159,22 @@ def stabilize(frames: Sequence[Float[Tensor, "1 1 h w"]]) -> Stabilization:
     height, width = frames[0].shape[-2:]
     identity = torch.eye(3, dtype=torch.float64)
 
-    found, mean = [identity], _Mean()
+    found, joined, mean = [identity], [True], _Mean()
     mean.add(pyramids[0], identity)
     for pyramid in pyramids[1:]:
         homography, correlation = _register(mean.levels(), pyramid, found[-1])
-        if correlation >= MINIMUM_CORRELATION:
+        joined.append(correlation >= MINIMUM_CORRELATION)
+        if joined[-1]:
             mean.add(pyramid, homography)
-        else:
-            homography = found[-1]  # a lost frame must not lead the next ones astray
-        found.append(homography)
+        # A lost frame must not lead the next ones astray.
+        found.append(homography if joined[-1] else found[-1])
 
-    refined, correlations, template = [], [], mean.levels()
-    for pyramid, start in zip(pyramids, found, strict=True):
-        homography, correlation = _register(template, pyramid, start, levels=2)
+    refined, correlations = [], []
+    for pyramid, start, inside in zip(pyramids, found, joined, strict=True):
+        # Without the frame itself: a mean that holds it where it is wrong would say that it is right.
+        mean.add(pyramid, start, -1.0 * inside)
+        homography, correlation = _register(mean.levels(), pyramid, start, levels=2)
+        mean.add(pyramid, start, 1.0 * inside)
         refined.append(homography)
         correlations.append(correlation)
     drift = corner_motion(torch.stack(refined), torch.stack(found), height, width) / max(height, width)
@@ -193,9 +196,9 @@ class _Mean:
     def __init__(self) -> None:
         self._sums: Pyramid = []
 
-    def add(self, pyramid: Pyramid, homography: Tensor) -> None:
+    def add(self, pyramid: Pyramid, homography: Tensor, times: float = 1.0) -> None:
         registered = [_registered(level, homography) for level in pyramid]
-        terms = [(contrast * weight, weight) for contrast, weight in registered]
+        terms = [(times * contrast * weight, times * weight) for contrast, weight in registered]
         if not self._sums:
             self._sums = terms
         else:
