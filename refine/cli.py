@@ -161,8 +161,6 @@ def fit(
         device=device,
         engine=None if engine == "auto" else engine,
     )
-    if quiet:  # engines announce in the log what takes long
-        logging.getLogger("refine").setLevel(logging.ERROR)
     flash: PointLight | None = None
     if position is not None:
         flash = PointLight.at(position, falloff=cast(Literal["none", "inverse_square"], falloff)).to(device)
@@ -183,7 +181,7 @@ def fit(
         "seed": seed,
         "threads": torch.get_num_threads(),
     }
-    with progress_bar(shown=not quiet and sys.stderr.isatty()) as progress, _enough_memory():
+    with progress_bar(shown=not quiet and sys.stderr.isatty()) as progress, _enough_memory(), _log(quiet):
         refined = refiner.fit(
             read,
             light=flash,
@@ -248,6 +246,18 @@ def _require_device(name: str) -> None:
         torch.zeros(1, device=name).item()
     except (RuntimeError, AssertionError, NotImplementedError, ImportError):
         raise UserError(f"--device {name!r} is not there on this machine; use --device cpu.") from None
+
+
+@contextmanager
+def _log(quiet: bool) -> Iterator[None]:
+    # Engines announce in the log what takes long.
+    log = logging.getLogger("refine")
+    level = log.level
+    log.setLevel(logging.ERROR if quiet else level)
+    try:
+        yield
+    finally:
+        log.setLevel(level)
 
 
 @contextmanager
