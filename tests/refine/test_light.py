@@ -14,9 +14,11 @@ import pytest
 import torch
 from torch import Tensor
 
+from nets.checkpoint import load_model
 from nets.color import linear_to_srgb
 from nets.data.pool_format import from_planes
 from nets.data.procedural import generate
+from nets.ensemble import FlipAverage
 from nets.render import Camera, PointLight, render
 from nets.svbrdf import SVBRDF
 from refine import Refined, Refiner
@@ -87,6 +89,14 @@ def test_a_known_material_gives_the_light_away(name: str, case: int, tmp_path: P
     assert error(guess, truth) == pytest.approx(WRONG_BY, abs=1e-5)
     photo = saved(tmp_path, material(name), truth)
     refined = Refiner(knows(material(name), guess)).fit(photo, iters=1)
+    assert error(refined.light, truth) < ALLOWED
+
+
+@pytest.mark.parametrize(("name", "case"), [("slate", 1), ("leather", 2), ("glazed_tile", 3)])
+def test_the_shipped_light_head_and_the_fit_find_the_flash(name: str, case: int, tmp_path: Path) -> None:
+    truth, network = PointLight.at(POSITIONS[case]), FlipAverage(load_model("default"))
+    photo = saved(tmp_path, material(name), truth)
+    refined = Refiner(lambda seen: (material(name), network.predict(seen)[1])).fit(photo, iters=1)
     assert error(refined.light, truth) < ALLOWED
 
 
