@@ -451,7 +451,13 @@ def test_a_terminal_sees_progress_and_control_c_ends_it(
     options = ("--iters", "100000", "--engine", "reference")  # the fused engine might be done too soon
     command = [sys.executable, "-m", "refine.cli", photo, "--init", checkpoint, *options, *FAST]
     with subprocess.Popen(
-        command, cwd=tmp_path, env=environment, stderr=theirs, stdout=subprocess.PIPE
+        command,
+        cwd=tmp_path,
+        env=environment,
+        stderr=theirs,
+        stdout=subprocess.PIPE,
+        # A shell's background jobs, and all they start, are born deaf to Control-C.
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
     ) as process:
         os.close(theirs)
         seen = b""
