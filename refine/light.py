@@ -79,9 +79,18 @@ class LightFit:
         )
 
 
-def fit_light(
-    svbrdf: SVBRDF, guess: PointLight, capture: Capture, settings: LightFit, falloff: FalloffChoice = None
-) -> PointLight:
+def check_falloff(name: str | None) -> None:
+    """Check that a falloff is one of `FalloffChoice`.
+
+    Raises:
+        ValueError: it is not, naming those there are.
+    """
+    if name not in (None, "auto", *FALLOFFS):
+        known = ", ".join((*FALLOFFS, "auto"))
+        raise ValueError(f"no falloff is called {name!r}; the known ones are {known}")
+
+
+def fit_light(svbrdf: SVBRDF, guess: PointLight, capture: Capture, settings: LightFit) -> PointLight:
     """Fit the light's position to the photo, from a guess.
 
     Two passes of the same robust least squares (scipy, trust region reflective). The first nearly ignores the
@@ -90,17 +99,20 @@ def fit_light(
 
     Args:
         svbrdf: the initialization, at the photo's size.
-        guess: the light head's estimate; its intensity is kept.
+        guess: the light head's estimate; intensity and falloff are kept.
         capture: the photo and camera.
         settings: see `LightFit`.
-        falloff: of the light; `auto` fits with and without and keeps what explains the photo better, None
-            keeps the guess's.
 
     Returns:
         The light with the fitted position, float32.
     """
-    if falloff != "auto":
-        return _fit(svbrdf, replace(guess, falloff=falloff or guess.falloff), capture, settings)[0]
+    return _fit(svbrdf, guess, capture, settings)[0]
+
+
+def fit_light_and_falloff(
+    svbrdf: SVBRDF, guess: PointLight, capture: Capture, settings: LightFit
+) -> PointLight:
+    """Fit the position as `fit_light` does with every falloff, and keep what explains the photo best."""
     fits = [_fit(svbrdf, replace(guess, falloff=name), capture, settings) for name in FALLOFFS]
     return min(fits, key=lambda fit: fit[1])[0]
 

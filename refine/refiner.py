@@ -20,7 +20,7 @@ from nets.svbrdf import SVBRDF
 from refine.capture import Capture
 from refine.engine import choose_engine, find_descend
 from refine.initialization import Predict, Predictor, initialize
-from refine.light import FALLOFFS, FalloffChoice, fit_light
+from refine.light import FalloffChoice, check_falloff, fit_light, fit_light_and_falloff
 from refine.maps import MapFormat, NormalConvention, write_maps
 from refine.parametrization import Parameters
 from refine.photo import ColorSpaceChoice, Photo, photo_from_array, read_photo, resize_photo
@@ -157,15 +157,17 @@ class Refiner:
                 become linear light.
             light: the flash, if known; otherwise the light head's estimate, fitted to the photo.
             falloff: of a light that is not known: `none` (the paper's), `inverse_square` (a real flash's),
-                or `auto`, which keeps what explains the photo better; None is what the model says.
+                or `auto`, which keeps what explains the photo better and needs a light fit; None is what the
+                model says.
             iters: steps of all stages together; None takes the recipe's, 0 returns the initialization.
             color_space: how `img` is encoded.
             progress: called after every iteration.
 
         Raises:
             refine.errors.UserError: if the photo cannot be read or used.
-            ValueError: if `iters` is negative.
+            ValueError: if `iters` is negative, or for an unknown falloff.
         """
+        check_falloff(falloff)
         torch.manual_seed(self.seed)
         recipe = self.recipe if iters is None else self.recipe.with_iterations(iters)
         photo = _photo(img, color_space)
@@ -180,13 +182,14 @@ class Refiner:
 
         clock = time.perf_counter()
         initial, guess = initialize(self.model, capture.photo)
-        if falloff in FALLOFFS:
+        if falloff is not None and falloff != "auto":
             guess = replace(guess, falloff=falloff)
         seconds["initialization"] = time.perf_counter() - clock
 
         if light is None and recipe.light_fit is not None and recipe.iterations > 0:
             clock = time.perf_counter()
-            light = fit_light(initial, guess, capture, recipe.light_fit, falloff).to(self.device)
+            fit = fit_light_and_falloff if falloff == "auto" else fit_light
+            light = fit(initial, guess, capture, recipe.light_fit).to(self.device)
             seconds["light"] = time.perf_counter() - clock
         light = light or guess
         svbrdf, losses = run_stages(initial, light, capture, recipe, seconds, progress, self.engine)

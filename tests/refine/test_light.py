@@ -22,6 +22,7 @@ from nets.ensemble import FlipAverage
 from nets.render import Camera, PointLight, render
 from nets.svbrdf import SVBRDF
 from refine import Refined, Refiner
+from refine.light import check_falloff
 from refine.stages import RECIPES, Recipe
 from tests.e2e.pictures import save_picture
 
@@ -140,6 +141,13 @@ def test_the_falloff_that_explains_the_photo_is_kept(
 def test_a_falloff_can_be_said(falloff: FallOff, iters: int, tmp_path: Path) -> None:
     refined, _ = fitted(tmp_path, iters=iters, falloff=falloff)
     assert refined.light.falloff == falloff
+
+
+def test_an_unknown_falloff_is_refused() -> None:
+    for known in (None, "auto", "none", "inverse_square"):
+        check_falloff(known)
+    with pytest.raises(ValueError, match="'linear'; the known ones are none, inverse_square, auto"):
+        check_falloff("linear")
 
 
 def fitted(tmp_path: Path, **more: object) -> tuple[Refined, PointLight]:
