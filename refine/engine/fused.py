@@ -213,9 +213,9 @@ def _run_pixels(
         total += losses.sum(axis=0)
         finished = span.stop
         mark = count * finished // problem.pixels
-        for iteration in range(told, mark if progress is not None else told):
-            assert progress is not None
-            progress(iteration + 1, float(total[iteration]) / (3 * finished))
+        if progress is not None:
+            for iteration in range(told, mark):
+                progress(iteration + 1, float(total[iteration]) / (3 * finished))
         told = mark
     return found, [float(loss) / (3 * problem.pixels) for loss in total]
 
@@ -237,9 +237,10 @@ def _descend_together(
         moving[layout.ROWS[name]] = True
     first, second = np.zeros_like(shared), np.zeros_like(shared)
     history: list[float] = []
-    best = shared.copy()
+    best, lowest = shared.copy(), math.inf
 
     def evaluate() -> Float[np.ndarray, "9"]:
+        nonlocal lowest
         now = shared.astype(real)
 
         def work(part: slice) -> None:
@@ -256,8 +257,8 @@ def _descend_together(
         workers.run(work, len(packed.counts))
         total = sums.sum(axis=0)
         history.append(float(total[-1]) / (3 * problem.pixels))
-        if _best(history) == len(history) - 1:
-            best[:] = shared
+        if history[-1] < lowest:  # the first of the lowest, as the reference has it; never NaN
+            best[:], lowest = shared, history[-1]
         return np.asarray(total[:-1] / problem.pixels)
 
     for iteration, step in enumerate(steps):
