@@ -35,7 +35,8 @@ def discriminator_loss(real: Sequence[Judgement], fake: Sequence[Judgement]) -> 
 
     Args:
         real: judgements of the truth, one per scale.
-        fake: judgements of a *detached* estimate: nothing is detached here.
+        fake: judgements of the estimate. Nothing is detached here: detach it, or take the gradient by the
+            discriminator's weights only, as `nets.trainer` does.
 
     Returns:
         The loss, >= 0; 0.25 if every logit is 1/2. float32 at least, whatever the logits are.

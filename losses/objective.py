@@ -18,13 +18,15 @@ from losses.reflectance import (
     light_l1,
     log_l1,
     map_l1,
+    network_maps,
+    parts_l1,
     rendering_log_l1,
     rendering_pair,
     white_from_one,
 )
 from losses.score import Perceptual, Score, TermWeights, exposure_gain, random_window
 from nets.color import gamma_encode
-from nets.generator import Generator, light_from_output, light_to_output, maps_to_svbrdf, svbrdf_to_maps
+from nets.generator import Generator, light_from_output, light_to_output, maps_to_svbrdf
 from nets.render import Camera, render
 from nets.sampling import LightDistribution
 from nets.svbrdf import CHANNELS, MAPS, SVBRDF
@@ -143,17 +145,17 @@ class SyntheticObjective:
         """Return both players' losses and their parts on one batch."""
         condition = batch.network_input
         maps, light = network(condition)
-        maps = maps.float()
-        estimate, truth_maps = maps_to_svbrdf(maps), svbrdf_to_maps(batch.truth)
-        # Normals are judged and compared as the material has them: unit length.
-        parts = _by_name(svbrdf_to_maps(estimate))
+        estimate = maps_to_svbrdf(maps.float())
+        parts, truths = network_maps(estimate), network_maps(batch.truth)
         seen = random_window(self.window, condition, generator)
         score = Score()
         score.add("light", self.light_weight, light_l1(light.float(), light_to_output(batch.light.position)))
-        for name, truth in _by_name(truth_maps).items():
+        for name, distance in parts_l1(parts, truths).items():
             factor = self.normal_l1_factor if name == "normal" else 1.0
-            score.add(name, self.maps.l1 * factor, (parts[name] - truth).abs().mean())
-            score.judge(name, critics[name], seen(condition), seen(parts[name]), seen(truth), self.maps)
+            score.add(name, self.maps.l1 * factor, distance)
+            score.judge(
+                name, critics[name], seen(condition), seen(parts[name]), seen(truths[name]), self.maps
+            )
         if self.rendering_weight:
             self._add_renderings(score, critics, estimate, batch, condition, seen, generator)
         return score.losses()
@@ -189,9 +191,13 @@ class SyntheticObjective:
         )
         count = self.perceptual_samples or batch.truth.batch
         score.perceive(
-            "rendering", self.perceptual, seen(shown)[:count], seen(real)[:count], self.rendering,
+            "rendering",
+            self.perceptual,
+            seen(shown)[:count],
+            seen(real)[:count],
+            self.rendering,
             self.rendering_weight,
-        )  # fmt: skip
+        )
 
     def _distance(self, rendering: Tensor, reference: Tensor) -> Tensor:
         if self.log_offset:
@@ -241,9 +247,8 @@ class RealObjective:
             raise ValueError("the batch holds no real pairs; give the training a folder of them")
         condition, reference = batch.pairs.network_input, batch.pairs.b
         maps, _ = network(condition)
-        _, light = network(batch.pairs.network_input_b)
-        position = light_from_output(light.float())
-        rendering = render(maps_to_svbrdf(maps.float()), position, self.camera)
+        light = light_from_output(network.estimate_light(batch.pairs.network_input_b).float())
+        rendering = render(maps_to_svbrdf(maps.float()), light, self.camera)
         if self.match_exposure:
             rendering = rendering * exposure_gain(rendering.detach(), reference)
         rendering, reference = white_from_one(rendering, reference)
@@ -298,10 +303,6 @@ class HybridObjective:
             {**synthetic.terms, **real.terms},
             synthetic.critics + real.critics,
         )
-
-
-def _by_name(maps: Tensor) -> dict[str, Tensor]:
-    return dict(zip(MAPS, torch.split(maps, [CHANNELS[name] for name in MAPS], dim=1), strict=True))
 
 
 def _weights_of(objective: SyntheticObjective | RealObjective) -> dict[str, Any]:

@@ -5,6 +5,8 @@ Each is a pure function of tensors. How they are weighted and combined is said i
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -23,9 +25,18 @@ ENCODING_FLOOR = 1e-3
 
 def map_l1(estimate: SVBRDF, truth: SVBRDF) -> dict[str, Float[Tensor, ""]]:
     """Return the mean L1 distance of each map, by name, in the network's range [-1, 1] (Eq. 2)."""
-    difference = (svbrdf_to_maps(estimate) - svbrdf_to_maps(truth)).abs()
-    parts = torch.split(difference, [CHANNELS[name] for name in MAPS], dim=1)
-    return {name: part.mean() for name, part in zip(MAPS, parts, strict=True)}
+    return parts_l1(network_maps(estimate), network_maps(truth))
+
+
+def network_maps(svbrdf: SVBRDF) -> dict[str, Float[Tensor, "b _ h w"]]:
+    """Return each map in the network's range [-1, 1], by name; normals are of unit length."""
+    parts = torch.split(svbrdf_to_maps(svbrdf), [CHANNELS[name] for name in MAPS], dim=1)
+    return dict(zip(MAPS, parts, strict=True))
+
+
+def parts_l1(estimate: Mapping[str, Tensor], truth: Mapping[str, Tensor]) -> dict[str, Float[Tensor, ""]]:
+    """Return the mean L1 distance of each map of two `network_maps`, by name."""
+    return {name: (estimate[name] - truth[name]).abs().mean() for name in MAPS}
 
 
 def log_l1(

@@ -9,15 +9,15 @@ from typing import TypeVar
 
 from torch import Tensor
 
-from losses.objective import HybridObjective, L1Objective, RealObjective, SyntheticObjective
+from losses.objective import HybridObjective, RealObjective, SyntheticObjective
+from losses.presets import AnyObjective
 from losses.score import Perceptual
 from losses.vgg import CK17, VGGFeatures, perceptual_distance
 
-AnyObjective = L1Objective | SyntheticObjective | RealObjective | HybridObjective
-T = TypeVar("T", bound=AnyObjective)
+T = TypeVar("T", bound=AnyObjective | RealObjective)
 
 
-def needs_vgg(objective: AnyObjective) -> bool:
+def needs_vgg(objective: AnyObjective | RealObjective) -> bool:
     """Return whether the objective weighs a VGG distance."""
     match objective:
         case HybridObjective():

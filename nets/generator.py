@@ -271,6 +271,11 @@ class Generator(nn.Module):
             maps = maps + self.detail(maps, more, seen)
         return torch.tanh(maps), self.light_head(features[-1])
 
+    def estimate_light(self, photo: Float[Tensor, "b 3 h w"]) -> Float[Tensor, "b 3"]:
+        """Return what `forward` says of the light, without the decoders: a fifth of the work or less."""
+        light: Tensor = self.light_head(self.encode(self.see(photo))[-1])
+        return light
+
     @torch.no_grad()
     def predict(self, photo: Float[Tensor, "b 3 h w"]) -> tuple[SVBRDF, PointLight]:
         """Estimate material and light of linear photos (clamped to 1 here), sides as in `forward`."""

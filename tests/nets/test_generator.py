@@ -149,6 +149,13 @@ def test_cues_and_detail_are_seen_and_trained(cues: bool, detail: int) -> None:
     assert all(parameter.grad is not None for parameter in network.parameters())
 
 
+@pytest.mark.parametrize("cues", [True, False])
+def test_the_light_alone_is_that_of_the_whole(cues: bool) -> None:
+    network = Generator(GeneratorConfig(2, 4, 2, shading_cues=cues))  # in training: dropout is not in its way
+    x = photo(16, 32, batch=2) * 2 - 1
+    assert torch.equal(network.estimate_light(x), network(x)[1])
+
+
 def test_detail_begins_as_no_correction_and_learns_from_the_input() -> None:
     network = Generator(GeneratorConfig(2, 4, 2, detail_channels=6)).eval()
     assert network.detail is not None
