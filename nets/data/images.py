@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import os
 import uuid
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -24,6 +25,16 @@ ROUGHNESS_FLOOR = 1.0 / 255.0
 
 class DataError(ValueError):
     """A file or folder that cannot be read as what it should be; the message names it."""
+
+
+LISTED = 5
+"""Reasons quoted in an error."""
+
+
+def listed(reasons: Sequence[str]) -> str:
+    """Join the first reasons for leaving files out, and say how many more there are."""
+    more = len(reasons) - LISTED
+    return "; ".join(reasons[:LISTED]) + (f"; and {more} more" if more > 0 else "")
 
 
 def read_image(path: Path) -> tuple[Float[np.ndarray, "height width channels"], bool]:

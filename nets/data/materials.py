@@ -11,17 +11,14 @@ from typing import Protocol, runtime_checkable
 
 import torch
 
-from nets.data.images import DataError
-from nets.data.pool import INDEX, MaterialPool, decode
-from nets.data.strips import read_strip
+from nets.data.images import DataError, listed
+from nets.data.pool import INDEX, MaterialPool, Part, decode
+from nets.data.strips import check_square_tiles, read_strip
 from nets.svbrdf import SVBRDF
 
 PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 PNG_END = b"IEND\xaeB`\x82"
 """Last bytes of a whole PNG: what a truncated one has lost."""
-
-LISTED = 3
-"""Reasons quoted in an error."""
 
 HEADER_BYTES = 24
 """Signature, length and type of the first chunk, width and height."""
@@ -61,7 +58,7 @@ class StripMaterials:
         skipped: a sentence for every file that is not used.
     """
 
-    def __init__(self, folder: Path, part: str | None = None, holdout: float = 0.02) -> None:
+    def __init__(self, folder: Path, part: Part | None = None, holdout: float = 0.02) -> None:
         """Look at every file's head and tail, so that no bad one stops a training at hour ten.
 
         Args:
@@ -82,8 +79,7 @@ class StripMaterials:
             except DataError as error:
                 skipped.append(str(error))
         if not sizes:
-            why = "; ".join(skipped[:LISTED])
-            raise DataError(f"{folder} holds no usable strip{f' ({why})' if why else ' (.png)'}")
+            raise DataError(f"{folder} holds no usable strip ({listed(skipped) or '.png'})")
         common = Counter(sizes.values()).most_common(1)[0][0]
         usable = [path for path, size in sizes.items() if size == common]
         skipped += [
@@ -93,9 +89,7 @@ class StripMaterials:
         ]
         every = max(2, round(1.0 / holdout))
         if part is not None and len(usable) > 1:
-            held = {path for number, path in enumerate(usable) if number % every == every // 2} or {
-                usable[-1]
-            }
+            held = set(usable[every // 2 :: every]) or {usable[-1]}
             usable = [path for path in usable if (path in held) == (part == "validation")]
         self.paths, self.skipped = usable, tuple(skipped)
 
@@ -121,7 +115,7 @@ class StripMaterials:
 
 
 def open_materials(
-    folder: Path, part: str | None = None, shares: Mapping[str, float] | None = None
+    folder: Path, part: Part | None = None, shares: Mapping[str, float] | None = None
 ) -> PoolMaterials | StripMaterials:
     """Open a pool or a folder of strips.
 
@@ -134,7 +128,7 @@ def open_materials(
         DataError: it is neither, or incomplete.
     """
     if (folder / INDEX).is_file():
-        return PoolMaterials(MaterialPool(folder, part=part), shares)  # type: ignore[arg-type]
+        return PoolMaterials(MaterialPool(folder, part=part), shares)
     return StripMaterials(folder, part)
 
 
@@ -156,6 +150,5 @@ def strip_size(path: Path) -> tuple[int, int]:
     if tail != PNG_END:
         raise DataError(f"{path} is truncated")
     width, height = int.from_bytes(head[16:20]), int.from_bytes(head[20:24])
-    if height < 1 or width not in (4 * height, 5 * height):
-        raise DataError(f"{path} is {width} x {height} pixels, which is not four or five square tiles")
+    check_square_tiles(path, width, height)
     return width, height

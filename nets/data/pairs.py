@@ -17,14 +17,11 @@ from jaxtyping import Float, UInt8
 from torch import Tensor
 
 from nets.color import linear_to_srgb, srgb_to_linear, to_network_input
-from nets.data.images import DataError, read_image, resize, rgb, to_tensor
+from nets.data.images import DataError, listed, read_image, resize, rgb, to_tensor
 from nets.data.photos import PHOTO_SUFFIXES
 
 SCALE = (0.6, 1.0)
 """Side of a square crop as a share of the photo's shorter side, drawn uniformly; the first end is open."""
-
-LISTED = 5
-"""Most reasons that the error for a folder without any usable scene repeats."""
 
 _LINEAR = srgb_to_linear((torch.arange(256) / 255.0).expand(3, 1, 256))[0, 0].contiguous()
 """Linear light by 8-bit sRGB code: half of a batch's time would otherwise go into powers."""
@@ -101,9 +98,9 @@ class PhotoPairs:
         if not scenes and not skipped and _photo_files(folder):
             raise DataError(f"{folder} holds photos, not scenes; give the folder that holds it")
         if not scenes:
-            more = len(skipped) - LISTED
-            reasons = "; ".join(skipped[:LISTED]) + (f"; and {more} more" if more > 0 else "")
-            raise DataError(f"{folder} holds no scene to train on: {reasons or 'it holds no folders'}")
+            raise DataError(
+                f"{folder} holds no scene to train on: {listed(skipped) or 'it holds no folders'}"
+            )
         self.scenes, self.skipped = tuple(scenes), tuple(skipped)
 
     def __len__(self) -> int:

@@ -56,8 +56,7 @@ def read_strip(
     pixels, _ = read_image(Path(path))
     height, width = pixels.shape[:2]
     if has_input is None:
-        if width not in (4 * height, 5 * height):
-            raise DataError(f"{path} is {width} x {height} pixels, which is not four or five square tiles")
+        check_square_tiles(path, width, height)
         has_input = width == 5 * height
     count = 5 if has_input else 4
     if width % count:
@@ -75,6 +74,16 @@ def read_strip(
         specular=specular.clamp(0.0, 1.0).contiguous(),
     )
     return Strip(svbrdf, photo)
+
+
+def check_square_tiles(path: Path, width: int, height: int) -> None:
+    """Check that an image has a strip's shape.
+
+    Raises:
+        DataError: it is not four or five times as wide as high.
+    """
+    if height < 1 or width not in (4 * height, 5 * height):
+        raise DataError(f"{path} is {width} x {height} pixels, which is not four or five square tiles")
 
 
 def write_strip(
