@@ -60,7 +60,6 @@ class Watch:
         held-out photos.
         """
         phase = trainer.config.phase_at(trainer.iteration)
-        state = torch.get_rng_state()
         trainer.network.eval()
         sums: dict[str, float] = {}
         for shard in range(VALIDATION_SHARDS):
@@ -70,7 +69,6 @@ class Watch:
                 losses = trainer.objective(trainer.network, trainer.critics, batch, generator)
             for name, term in {"loss": losses.generator, **losses.terms}.items():
                 sums[name] = sums.get(name, 0.0) + float(term) / VALIDATION_SHARDS
-        torch.set_rng_state(state)
         self._write({"iteration": trainer.iteration, "validation": _rounded(sums)})
         for name, value in sums.items():
             self.board.add_scalar(f"validation/{name}", value, trainer.iteration)
