@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -12,27 +11,23 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from losses.refinement import photo_distance
 from nets.checkpoint import load_model
 from nets.ensemble import FlipAverage
-from nets.render import Camera, PointLight, render, shade, shading_geometry, surface_points
+from nets.render import Camera, PointLight, render
 from nets.svbrdf import SVBRDF
 from refine.capture import Capture
-from refine.engine import choose_engine, find_descend
+from refine.engine import choose_engine
 from refine.initialization import Predict, Predictor, initialize
 from refine.light import FalloffChoice, check_falloff, fit_light, fit_light_and_falloff
 from refine.maps import MapFormat, NormalConvention, write_maps
-from refine.parametrization import Parameters
 from refine.photo import ColorSpaceChoice, Photo, photo_from_array, read_photo, resize_photo
+from refine.run import Report, run_stages
 from refine.stages import Recipe, find_recipe
 
 DEFAULT_RESOLUTION = 256
 """Longer side of the maps, pixels: what the network was trained on."""
 
 DEFAULT_RECIPE = "paper"
-
-Report = Callable[[str, int, int, float], None]
-"""Progress: stage name, iteration (from 1), iterations of all stages, loss."""
 
 
 @dataclass(frozen=True)
@@ -192,13 +187,14 @@ class Refiner:
             light = fit(initial, guess, capture, recipe.light_fit).to(self.device)
             seconds["light"] = time.perf_counter() - clock
         light = light or guess
-        svbrdf, losses = run_stages(initial, light, capture, recipe, seconds, progress, self.engine)
+        capture = replace(capture, light=light)
+        svbrdf, losses = run_stages(initial, capture, recipe, seconds, progress, self.engine)
         return Refined(
             svbrdf.detach(),
             initial,
             light,
             self.camera,
-            replace(capture, light=light),
+            capture,
             losses,
             seconds,
             recipe,
@@ -206,57 +202,6 @@ class Refiner:
             photo.source,
             engine=self.engine,
         )
-
-
-def run_stages(
-    initial: SVBRDF,
-    light: PointLight,
-    capture: Capture,
-    recipe: Recipe,
-    seconds: dict[str, float],
-    progress: Report | None = None,
-    engine: str | None = None,
-) -> tuple[SVBRDF, dict[str, list[float]]]:
-    """Run a recipe's stages from an initialization under a fixed light, by an engine of `refine.engine`.
-
-    Returns:
-        The material (the initialization itself, untouched, if the recipe has no iterations) and the losses
-        of every stage; `seconds` gains one entry per stage.
-    """
-    height, width = initial.size
-    geometry = shading_geometry(
-        surface_points(height, width, device=capture.photo.device), light, capture.camera
-    )
-    with torch.no_grad():
-        start = photo_distance(shade(initial, geometry), capture.photo, capture.unsaturated)
-    losses = {"initialization": [float(start)]}
-    if recipe.iterations == 0:
-        return initial, losses
-    descend = find_descend(choose_engine(engine, capture.photo.device.type))
-    parameters = Parameters.from_svbrdf(initial)
-    finished = 0
-    for stage in recipe.stages:
-        clock = time.perf_counter()
-        count = sum(name.split(" ")[0] == stage.name for name in losses)
-        label = f"{stage.name} {count + 1}" if count else stage.name
-        offsets = {name: zero.to(capture.photo.device) for name, zero in stage.offsets(height, width).items()}
-
-        def tell(iteration: int, loss: float, name: str = label, before: int = finished) -> None:
-            if progress is not None:
-                progress(name, before + iteration, recipe.iterations, loss)
-
-        parameters, losses[label] = descend(
-            parameters,
-            offsets,
-            capture,
-            geometry,
-            iterations=stage.iterations,
-            rates=stage.rates.moving(),
-            progress=tell,
-        )
-        finished += stage.iterations
-        seconds[label] = time.perf_counter() - clock
-    return parameters.svbrdf(), losses
 
 
 def _photo(img: str | Path | Photo | np.ndarray | Tensor, color_space: ColorSpaceChoice) -> Photo:

@@ -13,7 +13,7 @@ import platform
 import threading
 import time
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 import torch
@@ -25,7 +25,7 @@ from nets.svbrdf import SVBRDF
 from refine.capture import Capture
 from refine.engine import ENGINES, find_descend
 from refine.parametrization import Parameters
-from refine.refiner import run_stages
+from refine.run import run_stages
 from refine.stages import GlobalStage, PixelStage, find_recipe
 
 LIGHT = PointLight.at((0.2, -0.1, 2.2))
@@ -188,7 +188,7 @@ def _whole_run(engine: str, svbrdf: SVBRDF, capture: Capture) -> tuple[float, fl
     watcher = threading.Thread(target=watch, daemon=True)
     watcher.start()
     clock = time.perf_counter()
-    run_stages(svbrdf, LIGHT, capture, find_recipe("paper"), {}, None, engine)
+    run_stages(svbrdf, replace(capture, light=LIGHT), find_recipe("paper"), {}, None, engine)
     seconds = time.perf_counter() - clock
     peak = max(peak, _resident())
     done.set()

@@ -21,7 +21,7 @@ from refine.errors import UserError
 from refine.fidelity import rerendering_rmse
 from refine.initialization import initialize
 from refine.maps import read_maps
-from refine.refiner import run_stages
+from refine.run import run_stages
 from refine.stages import RECIPES, GlobalStage, PixelStage, Rates, Recipe
 from tests.e2e.pictures import LIGHT, flash_photo, save_picture
 from tests.helpers import assert_close, seeded
@@ -330,10 +330,16 @@ def test_the_result_holds_no_graph_and_the_input_is_untouched() -> None:
 def test_stages_start_where_the_last_one_ended() -> None:
     refined = Refiner(wrong).fit(flash_photo(24, 24), light=FLASH, iters=20)
     seconds: dict[str, float] = {}
-    again, losses = run_stages(refined.svbrdf, FLASH, refined.capture, refined.recipe, seconds)
+    again, losses = run_stages(refined.svbrdf, refined.capture, refined.recipe, seconds)
     assert losses["initialization"][0] == pytest.approx(min(refined.losses["per-pixel"]), rel=1e-3)
     assert min(losses["per-pixel"]) < min(refined.losses["per-pixel"])
     again.validate()
+
+
+def test_stages_ask_for_the_light() -> None:
+    refined = Refiner(wrong).fit(flash_photo(24, 24), light=FLASH, iters=0)
+    with pytest.raises(ValueError, match="light"):
+        run_stages(refined.initial, replace(refined.capture, light=None), refined.recipe, {})
 
 
 def test_photos_are_linearised_once() -> None:
