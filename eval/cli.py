@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated, Any
@@ -12,18 +14,20 @@ import typer
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-from eval.datasets import NOVEL_LIGHTS, SIZE, Protocol
+from eval.datasets import NOVEL_LIGHTS, SIZE, Protocol, spread
 from eval.development import (
     DEVELOPMENT,
-    as_json,
     count_scenes,
     evaluate,
     markdown,
-    provenance,
     refinement_estimator,
     require,
 )
+from eval.lights import evaluate_lights, light_estimator, lights_markdown
 from eval.photos import find_photos, photos_markdown, score_photos
+from eval.real import evaluate_real, real_estimator, real_markdown
+from eval.real_scenes import CAMERA, list_real_scenes
+from eval.report import Results, provenance
 from losses.perceptual import LPIPS
 from nets.checkpoint import CheckpointError
 from nets.data.images import DataError
@@ -39,6 +43,20 @@ INCOMPLETE = 3
 main = typer.Typer(add_completion=False, no_args_is_help=True, help="Evaluate SVBRDF capture.")
 errors = Console(stderr=True, soft_wrap=True, highlight=False)
 
+Data = Annotated[Path, typer.Option(help="Holds strips/des18_dev, strips/des19_dev and materials/dev.")]
+Checkpoint = Annotated[str, typer.Option(help="Checkpoint: a shipped name or a file.")]
+Checkpoints = Annotated[
+    list[str] | None, typer.Option(help="As often as there are checkpoints to compare (default).")
+]
+RecipeName = Annotated[str, typer.Option(help=f"none, or {', '.join(sorted(RECIPES))}.")]
+Iterations = Annotated[int | None, typer.Option(min=0, help="Iterations; the recipe's own by default.")]
+Scenes = Annotated[int | None, typer.Option(min=1, help="Scenes per set, evenly spread; all.")]
+Size = Annotated[int, typer.Option(min=64, help="Pixels of photo and maps.")]
+Flips = Annotated[bool, typer.Option(help="Average the network over four mirrored photos.")]
+Threads = Annotated[int, typer.Option(min=0, help="CPU threads; 0 leaves torch's choice.")]
+JsonFile = Annotated[Path | None, typer.Option("--json", help="Write everything here.")]
+MarkdownFile = Annotated[Path | None, typer.Option("--markdown", help="Write the table here.")]
+
 
 @main.callback()
 def evaluation() -> None:
@@ -47,95 +65,129 @@ def evaluation() -> None:
 
 @main.command()
 def development(
-    data: Annotated[Path, typer.Option(help="Holds strips/des18_dev, strips/des19_dev and materials/dev.")],
-    init: Annotated[str, typer.Option(help="Checkpoint: a shipped name or a file.")] = "default",
-    recipe: Annotated[str, typer.Option(help=f"none, or {', '.join(sorted(RECIPES))}.")] = "none",
-    iters: Annotated[int | None, typer.Option(min=0, help="Iterations; the recipe's own by default.")] = None,
-    scenes: Annotated[int | None, typer.Option(min=1, help="Scenes per set, evenly spread; all.")] = None,
-    size: Annotated[int, typer.Option(min=64, help="Pixels of photo and maps.")] = SIZE,
+    data: Data,
+    init: Checkpoint = "default",
+    recipe: RecipeName = "none",
+    iters: Iterations = None,
+    scenes: Scenes = None,
+    size: Size = SIZE,
     lights: Annotated[int, typer.Option(min=1, help="Novel lights per scene.")] = NOVEL_LIGHTS,
     seed: Annotated[int, typer.Option(min=0, help="Of the novel lights and of refinement.")] = 0,
     estimate_light: Annotated[bool, typer.Option(help="Do not tell the method the photo's light.")] = False,
-    flips: Annotated[bool, typer.Option(help="Average the network over four mirrored photos.")] = True,
+    flips: Flips = True,
     stored_input: Annotated[bool, typer.Option(help="Use the photos stored in strips.")] = False,
-    threads: Annotated[int, typer.Option(min=0, help="CPU threads; 0 leaves torch's choice.")] = 0,
-    json_file: Annotated[Path | None, typer.Option("--json", help="Write everything here.")] = None,
-    markdown_file: Annotated[Path | None, typer.Option("--markdown", help="Write the table here.")] = None,
+    threads: Threads = 0,
+    json_file: JsonFile = None,
+    markdown_file: MarkdownFile = None,
 ) -> None:
     """Score a checkpoint's initialization, and its refinement, on the development sets."""
-    if threads:
-        torch.set_num_threads(threads)
-    try:
+    _use_threads(threads)
+    with _mistakes():
         require(data, DEVELOPMENT)
         chosen = find_recipe("paper" if recipe == "none" else recipe)
         refiner = Refiner(init, chosen, resolution=size, flips=flips, seed=seed)
-    except (DataError, CheckpointError, ValueError) as error:
-        errors.print(f"refine-eval: {error}", markup=False)
-        raise typer.Exit(BAD_USAGE) from None
 
-    origin = provenance()  # of the code that runs, whatever is committed meanwhile
+    about = provenance()  # of the code that runs, whatever is committed meanwhile
     estimator = refinement_estimator(refiner, 0 if recipe == "none" else iters, estimate_light=estimate_light)
     protocol = Protocol(size=size, lights=lights, seed=seed, stored_input=stored_input)
-    with _progress() as bar:
-        task = bar.add_task("scenes", total=count_scenes(data, DEVELOPMENT, scenes))
-        results = evaluate(
-            estimator,
-            data,
-            DEVELOPMENT,
-            protocol,
-            scenes,
-            LPIPS(),
-            progress=lambda name: bar.update(task, advance=1, description=name[:40]),
-        )
+    with _progress(count_scenes(data, DEVELOPMENT, scenes)) as tell:
+        results = evaluate(estimator, data, DEVELOPMENT, protocol, scenes, LPIPS(), tell)
     results.settings |= {
         "init": init,
         "recipe": recipe,
         "iters": iters,
         "estimate_light": estimate_light,
         "flips": flips,
+        **about,
     }
-    results.settings |= origin
+    _finish(results, markdown(results), json_file, markdown_file)
 
-    table = markdown(results)
-    typer.echo(table, nl=False)
-    if markdown_file is not None:
-        markdown_file.write_text(table, encoding="utf-8")
-    if json_file is not None:
-        json_file.write_text(json.dumps(as_json(results), indent=1, sort_keys=True) + "\n", encoding="utf-8")
-    if results.skipped:
-        for name, reason in results.skipped.items():
-            errors.print(f"refine-eval: skipped {name}: {reason}", markup=False)
-        raise typer.Exit(INCOMPLETE)
+
+@main.command()
+def real(
+    folder: Annotated[Path, typer.Argument(metavar="DIR", help="Holds a folder of photos per surface.")],
+    init: Checkpoints = None,
+    recipe: RecipeName = "none",
+    iters: Iterations = None,
+    scenes: Scenes = None,
+    size: Size = SIZE,
+    seed: Annotated[int, typer.Option(min=0, help="Of refinement.")] = 0,
+    flips: Flips = True,
+    threads: Threads = 0,
+    json_file: JsonFile = None,
+    markdown_file: MarkdownFile = None,
+) -> None:
+    """Score checkpoints on real surfaces in several flash photos of known lights (paper Table 2)."""
+    _use_threads(threads)
+    inits = init or ["default"]
+    with _mistakes():
+        count = len(spread(len(list_real_scenes(folder)), scenes))
+        chosen = find_recipe("paper" if recipe == "none" else recipe)
+        refiners = {
+            name: Refiner(name, chosen, camera=CAMERA, resolution=size, flips=flips, seed=seed)
+            for name in inits
+        }
+
+    about = provenance()
+    estimator = real_estimator(refiners, 0 if recipe == "none" else iters)
+    with _progress(count) as tell:
+        results = evaluate_real(estimator, folder, size, scenes, LPIPS(), tell)
+    results.settings |= {"inits": inits, "recipe": recipe, "iters": iters, "flips": flips, "seed": seed}
+    results.settings |= about
+    _finish(results, real_markdown(results), json_file, markdown_file)
+
+
+@main.command()
+def light(
+    data: Data,
+    init: Checkpoints = None,
+    recipe: Annotated[str, typer.Option(help=f"Whose light fit: {', '.join(sorted(RECIPES))}.")] = "paper",
+    scenes: Scenes = None,
+    size: Size = SIZE,
+    seed: Annotated[int, typer.Option(min=0, help="Of the lights.")] = 0,
+    flips: Flips = True,
+    threads: Threads = 0,
+    json_file: JsonFile = None,
+    markdown_file: MarkdownFile = None,
+) -> None:
+    """Score checkpoints' light heads, alone and after the light fit, on the development sets."""
+    _use_threads(threads)
+    inits = init or ["default"]
+    with _mistakes():
+        require(data, DEVELOPMENT)
+        refiners = {name: Refiner(name, recipe, resolution=size, flips=flips, seed=seed) for name in inits}
+
+    about = provenance()
+    with _progress(count_scenes(data, DEVELOPMENT, scenes)) as tell:
+        results = evaluate_lights(light_estimator(refiners), data, DEVELOPMENT, size, seed, scenes, tell)
+    results.settings |= {"inits": inits, "recipe": recipe, "flips": flips, **about}
+    _finish(results, lights_markdown(results), json_file, markdown_file)
 
 
 @main.command()
 def photos(
     folders: Annotated[list[Path], typer.Argument(help="Photos, or folders of them.")],
-    init: Annotated[str, typer.Option(help="Checkpoint: a shipped name or a file.")] = "default",
+    init: Checkpoint = "default",
     recipe: Annotated[str, typer.Option(help=f"One of {', '.join(sorted(RECIPES))}.")] = "paper",
-    iters: Annotated[int | None, typer.Option(min=0, help="Iterations; the recipe's own by default.")] = None,
+    iters: Iterations = None,
     part: Annotated[
         str, typer.Option(help="K/N: only every N-th photo from the K-th, to share work.")
     ] = "1/1",
-    threads: Annotated[int, typer.Option(min=0, help="CPU threads; 0 leaves torch's choice.")] = 0,
-    json_file: Annotated[Path | None, typer.Option("--json", help="Write the scores here.")] = None,
+    threads: Threads = 0,
+    json_file: JsonFile = None,
 ) -> None:
     """Refine real photos and say whether each is explained, with legal maps."""
-    if threads:
-        torch.set_num_threads(threads)
+    _use_threads(threads)
     found = find_photos(folders)
-    try:
+    with _mistakes():
         first, step = (int(number) for number in part.split("/"))
         refiner = Refiner(init, recipe)
         if not 1 <= first <= step:
             raise ValueError(f"--part {part} is not K/N with K from 1 to N")
         if not found:
             raise ValueError(f"no photos below {', '.join(map(str, folders))}")
-    except ValueError as error:
-        errors.print(f"refine-eval: {error}", markup=False)
-        raise typer.Exit(BAD_USAGE) from None
 
-    origin = provenance()
+    about = provenance()
     found = found[first - 1 :: step]
     skipped: list[Path] = []
 
@@ -144,24 +196,55 @@ def photos(
         errors.print(f"refine-eval: skipped {path}: {reason}", markup=False)
 
     scores = []
-    with _progress() as bar:
-        task = bar.add_task("photos", total=len(found))
+    with _progress(len(found)) as tell:
         for score in score_photos(refiner, found, iters, skip):
             scores.append(score)
-            bar.update(task, advance=1, description=score.name[-40:])
+            tell(score.name)
     if scores:
         typer.echo(photos_markdown(scores), nl=False)
     if json_file is not None:
-        record: dict[str, Any] = {"init": init, "recipe": recipe, "iters": iters, **origin}
+        record: dict[str, Any] = {"init": init, "recipe": recipe, "iters": iters, **about}
         record["photos"] = [asdict(score) for score in scores]
         json_file.write_text(json.dumps(record, indent=1) + "\n", encoding="utf-8")
     if skipped:
         raise typer.Exit(INCOMPLETE)
 
 
-def _progress() -> Progress:
+def _use_threads(count: int) -> None:
+    if count:
+        torch.set_num_threads(count)
+
+
+@contextmanager
+def _mistakes() -> Iterator[None]:
+    """Turn what a user can mend into one sentence and an exit code, before anything is computed."""
+    try:
+        yield
+    except (DataError, CheckpointError, ValueError) as error:
+        errors.print(f"refine-eval: {error}", markup=False)
+        raise typer.Exit(BAD_USAGE) from None
+
+
+@contextmanager
+def _progress(total: int) -> Iterator[Callable[[str], None]]:
+    """Show a bar on a terminal; yield what is to be called with the name of everything that is done."""
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-    return Progress(*columns, console=errors, transient=True, disable=not errors.is_terminal)
+    with Progress(*columns, console=errors, transient=True, disable=not errors.is_terminal) as bar:
+        task = bar.add_task("scenes", total=total)
+        yield lambda name: bar.update(task, advance=1, description=name[-40:])
+
+
+def _finish(results: Results[Any], table: str, json_file: Path | None, markdown_file: Path | None) -> None:
+    """Print and write a table; name what was skipped."""
+    typer.echo(table, nl=False)
+    if markdown_file is not None:
+        markdown_file.write_text(table, encoding="utf-8")
+    if json_file is not None:
+        json_file.write_text(json.dumps(results.as_json(), indent=1, sort_keys=True) + "\n", encoding="utf-8")
+    if results.skipped:
+        for name, reason in results.skipped.items():
+            errors.print(f"refine-eval: skipped {name}: {reason}", markup=False)
+        raise typer.Exit(INCOMPLETE)
 
 
 if __name__ == "__main__":

@@ -6,12 +6,9 @@ Layout of the data folder: `strips/des18_dev`, `strips/des19_dev`, `materials/de
 
 from __future__ import annotations
 
-import math
-import platform
-import subprocess
 import time
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Literal
 
@@ -21,6 +18,7 @@ from torch import Tensor
 
 from eval.datasets import CAMERA, YARDSTICK, Protocol, Scene, list_scenes, pbr_scenes, spread, strip_scenes
 from eval.metrics import SceneScores, evaluate_material
+from eval.report import Results, markdown_table, number, origin, skipped_lines
 from losses.perceptual import LPIPS
 from nets.data.images import DataError
 from nets.svbrdf import SVBRDF
@@ -74,19 +72,8 @@ class ScoredScene:
     seconds: float
 
 
-@dataclass
-class Results:
-    """Everything a table is made of.
-
-    Attributes:
-        scored: one entry per method and scene.
-        skipped: name of an unreadable scene to the reason.
-        settings: of the run, as printed in the caption and saved.
-    """
-
-    scored: list[ScoredScene] = field(default_factory=list)
-    skipped: dict[str, str] = field(default_factory=dict)
-    settings: dict[str, Any] = field(default_factory=dict)
+class DevelopmentResults(Results[ScoredScene]):
+    """What the development table is made of."""
 
     def rows(self) -> list[dict[str, Any]]:
         """Return table rows: scene count, mean scores and seconds per method and set, then the strips' mean.
@@ -123,7 +110,7 @@ def evaluate(
     scenes: int | None = None,
     lpips: LPIPS | None = None,
     progress: Callable[[str], None] | None = None,
-) -> Results:
+) -> DevelopmentResults:
     """Run methods over test sets and score every estimate.
 
     Args:
@@ -139,21 +126,36 @@ def evaluate(
         DataError: if a set's folder is missing or empty. Unreadable scenes are recorded and skipped.
     """
     require(data, sets)
-    results = Results(settings={"sets": [s.name for s in sets], **asdict(protocol)})
+    results = DevelopmentResults(settings={"sets": [s.name for s in sets], **asdict(protocol)})
 
+    for test_set, scene in read_scenes(data, sets, protocol, scenes, results.skipped):
+        for method, found in estimate(scene).items():
+            scores = evaluate_material(found.svbrdf, scene.truth, scene.lights, CAMERA, lpips=lpips)
+            results.scored.append(ScoredScene(method, test_set.name, scene.name, scores, found.seconds))
+        if progress is not None:
+            progress(scene.name)
+    return results
+
+
+def read_scenes(
+    data: Path,
+    sets: Sequence[TestSet],
+    protocol: Protocol,
+    scenes: int | None,
+    skipped: dict[str, str],
+) -> Iterator[tuple[TestSet, Scene]]:
+    """Read the scenes of test sets one after the other; arguments as in `evaluate`.
+
+    A scene that cannot be read becomes an entry of `skipped`: its set and name, and the reason.
+    """
     for test_set in sets:
 
         def skip(name: str, error: DataError, prefix: str = test_set.name) -> None:
-            results.skipped[f"{prefix}/{name}"] = str(error)
+            skipped[f"{prefix}/{name}"] = str(error)
 
         read = pbr_scenes if test_set.kind == "pbr" else strip_scenes
         for scene in read(data / test_set.folder, protocol, scenes, skip):
-            for method, found in estimate(scene).items():
-                scores = evaluate_material(found.svbrdf, scene.truth, scene.lights, CAMERA, lpips=lpips)
-                results.scored.append(ScoredScene(method, test_set.name, scene.name, scores, found.seconds))
-            if progress is not None:
-                progress(scene.name)
-    return results
+            yield test_set, scene
 
 
 def evaluate_predictor(
@@ -244,20 +246,6 @@ def count_scenes(data: Path, sets: Sequence[TestSet], scenes: int | None) -> int
     return sum(len(spread(len(list_scenes(data / s.folder, s.kind)), scenes)) for s in sets)
 
 
-def provenance() -> dict[str, str]:
-    """Return the commit and the kind of machine that figures were made with."""
-    here = Path(__file__).parent
-    try:
-        git = subprocess.run(
-            ["git", "rev-parse", "--short=10", "HEAD"], cwd=here, capture_output=True, text=True, check=True
-        )
-        commit = git.stdout.strip()
-    except (OSError, subprocess.CalledProcessError):
-        commit = "unknown"
-    machine = f"{platform.machine()}, {torch.get_num_threads()} threads, torch {torch.__version__}"
-    return {"commit": commit, "machine": machine}
-
-
 COLUMNS = {
     "N": "normal",
     "D": "diffuse",
@@ -283,48 +271,15 @@ def caption(settings: Mapping[str, Any]) -> str:
         f"{', '.join(settings['sets'])}; {settings['size']} px, {settings['lights']} novel lights per scene, "
         f"seed {settings['seed']}; photo {photo}, its light {light}; checkpoint {settings.get('init', '?')}"
         f"{', averaged over four flips' if settings.get('flips') else ''}; "
-        f"commit {settings.get('commit', '?')}; {settings.get('machine', '?')}."
+        f"{origin(settings)}."
     )
 
 
-def markdown(results: Results) -> str:
+def markdown(results: DevelopmentResults) -> str:
     """Return the table in Markdown with its caption and the list of skipped scenes."""
-    heads = ["method", "set", "scenes", *COLUMNS]
-    lines = [
-        caption(results.settings),
-        "",
-        f"| {' | '.join(heads)} |",
-        "|---|---|" + "---:|" * (len(heads) - 2),
-    ]
+    rows = []
     for row in results.rows():
-        cells = [row["method"], row["set"], str(row["scenes"])]
-        cells += [_number(row.get(name), 1 if name == "seconds" else 3) for name in COLUMNS.values()]
-        lines.append(f"| {' | '.join(cells)} |")
-    if results.skipped:
-        lines += ["", "Skipped:", ""]
-        lines += [f"- {name}: {reason}" for name, reason in results.skipped.items()]
-    return "\n".join(lines) + "\n"
-
-
-def as_json(results: Results) -> dict[str, Any]:
-    """Return settings, table rows, every scene's scores and the skipped scenes as plain data; NaN is None."""
-    scenes = [asdict(entry) for entry in results.scored]
-    plain = {
-        "settings": results.settings,
-        "rows": results.rows(),
-        "scenes": scenes,
-        "skipped": results.skipped,
-    }
-    return {key: _without_nan(value) for key, value in plain.items()}
-
-
-def _number(value: float | None, digits: int) -> str:
-    return "-" if value is None or math.isnan(value) else f"{value:.{digits}f}"
-
-
-def _without_nan(value: Any) -> Any:
-    if isinstance(value, dict):
-        return {key: _without_nan(item) for key, item in value.items()}
-    if isinstance(value, list):
-        return [_without_nan(item) for item in value]
-    return None if isinstance(value, float) and math.isnan(value) else value
+        cells = [number(row.get(name), 1 if name == "seconds" else 3) for name in COLUMNS.values()]
+        rows.append([row["method"], row["set"], str(row["scenes"]), *cells])
+    table = markdown_table(["method", "set", "scenes", *COLUMNS], rows, texts=2)
+    return "\n".join([caption(results.settings), "", *table, *skipped_lines(results.skipped)]) + "\n"
