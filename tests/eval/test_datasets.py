@@ -4,7 +4,6 @@ import json
 from pathlib import Path
 
 import numpy as np
-import OpenImageIO as oiio
 import pytest
 import torch
 from typer.testing import CliRunner
@@ -23,50 +22,11 @@ from eval.datasets import (
 )
 from eval.development import STRIPS, STRIPS_MEAN, Estimate, evaluate, evaluate_predictor, markdown
 from nets.data.images import DataError
-from nets.data.strips import write_strip
 from nets.render import PointLight, render
-from nets.svbrdf import SVBRDF
 from refine.refiner import Refiner
+from tests.eval_files import FakeModel, grey, material
 
 SMALL = Protocol(size=64, lights=3)
-
-
-def material(seed: int, size: int = 80) -> SVBRDF:
-    generator = torch.Generator().manual_seed(seed)
-    coarse = torch.rand(1, 10, 8, 8, generator=generator)
-    maps = torch.nn.functional.interpolate(coarse, size=(size, size), mode="bilinear")
-    normal, diffuse, roughness, specular = torch.split(maps, [3, 3, 1, 3], dim=1)
-    normal = torch.nn.functional.normalize(normal - torch.tensor([0.5, 0.5, -0.5])[:, None, None], dim=1)
-    return SVBRDF(normal, diffuse, 0.2 + 0.7 * roughness, 0.2 * specular)
-
-
-def write_pbr(folder: Path, pixels: int = 72) -> None:
-    folder.mkdir(parents=True)
-    for name, value in {
-        "basecolor": (188, 188, 188),
-        "normal": (128, 128, 255),
-        "roughness": (128,) * 3,
-    }.items():
-        image = oiio.ImageOutput.create(str(folder / f"{name}.png"))
-        assert image is not None
-        array = np.broadcast_to(np.array(value, dtype=np.uint8), (pixels, pixels, 3))
-        image.open(str(folder / f"{name}.png"), oiio.ImageSpec(pixels, pixels, 3, "uint8"))
-        image.write_image(np.ascontiguousarray(array))
-        image.close()
-
-
-@pytest.fixture
-def data(tmp_path: Path) -> Path:
-    """Return a data folder in the layout of the development set, two or three scenes each."""
-    for test_set in STRIPS:
-        folder = tmp_path / test_set.folder
-        folder.mkdir(parents=True)
-        for seed in range(3):
-            stored = torch.full((1, 3, 80, 80), 0.5) if test_set.name == "des18_dev" else None
-            write_strip(folder / f"scene_{seed}.png", material(seed), stored)
-    for name in ("brick", "wood"):
-        write_pbr(tmp_path / "materials" / "dev" / name)
-    return tmp_path
 
 
 def test_a_scene_is_a_legal_material_and_the_photo_of_it(data: Path) -> None:
@@ -150,10 +110,6 @@ def test_a_missing_or_empty_folder_is_named(tmp_path: Path) -> None:
         list_scenes(tmp_path, "pbr")
 
 
-def grey(photo: torch.Tensor) -> SVBRDF:
-    return SVBRDF.constant(*photo.shape[-2:])
-
-
 def test_evaluate_predictor_averages_the_two_folders(data: Path) -> None:
     found = evaluate_predictor(grey, data, scenes=2, lights=2, size=64, lpips=False)
     assert set(found) == {"des18_dev", "des19_dev", "mean"}
@@ -177,18 +133,8 @@ def test_a_perfect_method_scores_zero_and_a_constant_does_not(data: Path) -> Non
     assert rows["grey", "des19_dev"]["roughness"] > 0.05
 
 
-class FakeModel:
-    def to(self, device: torch.device) -> "FakeModel":
-        return self
-
-    def predict(self, photo: torch.Tensor) -> tuple[SVBRDF, PointLight]:
-        return grey(photo), PointLight.at((0.0, 0.0, 2.0))
-
-
 @pytest.fixture
-def run(monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr("refine.refiner.load_model", lambda name: FakeModel())
-
+def run(no_network: None):
     def invoke(*arguments: str):
         return CliRunner().invoke(cli.main, ["development", "--size", "64", "--lights", "2", *arguments])
 
