@@ -112,6 +112,9 @@ def real(
     scenes: Scenes = None,
     size: Size = SIZE,
     seed: Annotated[int, typer.Option(min=0, help="Of refinement.")] = 0,
+    match_exposure: Annotated[
+        bool, typer.Option(help="Refine under a light as bright as the initialization needs it, not 1.")
+    ] = False,
     flips: Flips = True,
     threads: Threads = 0,
     json_file: JsonFile = None,
@@ -129,11 +132,19 @@ def real(
         }
 
     about = provenance()
-    estimator = real_estimator(refiners, 0 if recipe == "none" else iters)
+    total = 0 if recipe == "none" else iters
+    estimator = real_estimator(refiners, total, match_exposure=match_exposure)
     with _progress(count) as tell:
         results = evaluate_real(estimator, folder, size, scenes, LPIPS(), tell)
-    results.settings |= {"inits": inits, "recipe": recipe, "iters": iters, "flips": flips, "seed": seed}
-    results.settings |= about
+    results.settings |= {
+        "inits": inits,
+        "recipe": recipe,
+        "iters": iters,
+        "match_exposure": match_exposure,
+        "flips": flips,
+        "seed": seed,
+        **about,
+    }
     _finish(results, real_markdown(results), json_file, markdown_file)
 
 

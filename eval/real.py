@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -85,24 +85,31 @@ Estimator = Callable[[RealScene], Mapping[str, Estimate]]
 """From a scene (of which it may look at photo and light only) to estimates by method name."""
 
 
-def real_estimator(refiners: Mapping[str, Refiner], iters: int | None) -> Estimator:
+def real_estimator(
+    refiners: Mapping[str, Refiner], iters: int | None, *, match_exposure: bool = False
+) -> Estimator:
     """Return every checkpoint's initialization and, if any iteration is asked for, its refinement.
 
     Args:
         refiners: by the name of their checkpoint; their camera should be `CAMERA`.
         iters: of the whole recipe; None takes the recipe's own.
+        match_exposure: refine under a light as bright as the initialization needs it (`exposure`), not 1:
+            what was merely exposed otherwise than in training need not be explained by the maps.
     """
 
     def estimate(scene: RealScene) -> dict[str, Estimate]:
         found = {}
         for name, refiner in refiners.items():
             total = refiner.recipe.iterations if iters is None else iters
-            refined = refiner.fit(scene.photo, light=scene.light, iters=total)
-            found[f"{name}, initialization"] = Estimate(refined.initial, refined.seconds["initialization"])
+            first = refiner.fit(scene.photo, light=scene.light, iters=0)
+            seconds = first.seconds["initialization"]
+            found[f"{name}, initialization"] = Estimate(first.initial, seconds)
             if total:
-                seconds = sum(refined.seconds.values())
+                factor = exposure(first.initial, scene) if match_exposure else 1.0
+                light = replace(scene.light, intensity=factor * scene.light.intensity)
+                refined = refiner.fit(scene.photo, light=light, iters=total)
                 label = f"{name}, {refiner.recipe.name}, {total} iterations"
-                found[label] = Estimate(refined.svbrdf, seconds)
+                found[label] = Estimate(refined.svbrdf, sum(refined.seconds.values()))
         return found
 
     return estimate
@@ -185,14 +192,15 @@ def evaluate_real(
 
 def caption(settings: Mapping[str, Any]) -> str:
     """Return a few sentences that say how the figures came about."""
+    brightness = "as bright as the initialization needs it" if settings.get("match_exposure") else "of intensity 1"
+    flips = ", averaged over four flips" if settings.get("flips") else ""
     return (
         f"Photos of {settings['folder']} that were not given, {settings['size']} px: RMSE (one over all "
         f"photos of a scene, encoded with 1/2.2) and LPIPS v0.1 AlexNet, averaged over scenes. Given is the "
-        f"photo whose light is most central, and that light. Camera at the flash, inverse-square falloff; "
-        f"one exposure per estimate, the median ratio of the given photo to its rendering. Lights are "
+        f"photo whose light is most central, and that light, {brightness}. Camera at the flash, inverse-square "
+        f"falloff; one exposure per estimate, the median ratio of the given photo to its rendering. Lights are "
         f"uncertain where their calibration does not call itself {RELIABLE}. Checkpoints "
-        f"{', '.join(settings.get('inits', '?'))}"
-        f"{', averaged over four flips' if settings.get('flips') else ''}; seed {settings.get('seed', '?')}; "
+        f"{', '.join(settings.get('inits', '?'))}{flips}; seed {settings.get('seed', '?')}; "
         f"{origin(settings)}."
     )
 

@@ -23,6 +23,7 @@ from eval.real import (
 )
 from eval.real_scenes import CAMERA, RealScene, list_real_scenes, read_real_scene, read_real_scenes
 from nets.data.images import DataError
+from nets.render import PointLight
 from nets.svbrdf import SVBRDF
 from refine.refiner import Refiner
 from tests.eval_files import PLACES, WIDTH, FakeModel, flash_photo, grey, material, write_surface
@@ -138,20 +139,41 @@ def test_one_photo_leaves_nothing_to_compare(tmp_path: Path, surface: SVBRDF) ->
         read_real_scene(folder, SIZE)
 
 
+class Spy(Refiner):
+    """Remembers what it was given."""
+
+    def fit(self, img, *, light=None, **options):
+        self.given = (img, light)
+        return super().fit(img, light=light, **options)
+
+
 def test_refinement_is_given_photo_and_light(scene: RealScene) -> None:
-    given = []
-
-    class Spy(Refiner):
-        def fit(self, img, *, light=None, **options):
-            given.append((img, light))
-            return super().fit(img, light=light, **options)
-
     refiner = Spy(FakeModel(), camera=CAMERA, resolution=SIZE)
     found = real_estimator({"grey": refiner}, 60)(scene)
     assert list(found) == ["grey, initialization", "grey, paper, 60 iterations"]
     assert not torch.equal(*(estimate.svbrdf.diffuse for estimate in found.values()))
+    photo, light = refiner.given
+    assert photo is scene.photo
+    assert torch.equal(light.position, scene.light.position)
+    assert (light.falloff, light.intensity.tolist()) == ("inverse_square", [[1.0, 1.0, 1.0]])
     assert list(real_estimator({"grey": refiner}, 0)(scene)) == ["grey, initialization"]
-    assert all(img is scene.photo and light is scene.light for img, light in given)
+
+
+def test_refinement_under_a_light_as_bright_as_needed_leaves_brightness_alone(
+    scene: RealScene, surface: SVBRDF
+) -> None:
+    def brighter(photo: torch.Tensor) -> tuple[SVBRDF, PointLight]:
+        whole = surface.map(lambda tensor: torch.nn.functional.interpolate(tensor, size=photo.shape[-2:]))
+        return whole, PointLight.at((0.0, 0.0, 2.0))
+
+    refiner = Spy(brighter, camera=CAMERA, resolution=SIZE)
+    first, refined = real_estimator({"true": refiner}, 40, match_exposure=True)(scene).values()
+    assert refiner.given[1].intensity[0, 0] == pytest.approx(exposure(first.svbrdf, scene))
+    darkened = real_estimator({"true": refiner}, 40)(scene)["true, paper, 40 iterations"]
+    change, drop = (
+        float((first.svbrdf.diffuse - other.svbrdf.diffuse).mean()) for other in (refined, darkened)
+    )
+    assert abs(change) < 0.2 * drop
 
 
 def test_uncertain_lights_stand_apart() -> None:
