@@ -192,15 +192,16 @@ def evaluate_real(
 
 def caption(settings: Mapping[str, Any]) -> str:
     """Return a few sentences that say how the figures came about."""
-    brightness = "as bright as the initialization needs it" if settings.get("match_exposure") else "of intensity 1"
+    matched = settings.get("match_exposure")
+    brightness = "as bright as the initialization needs it" if matched else "of intensity 1"
     flips = ", averaged over four flips" if settings.get("flips") else ""
     return (
         f"Photos of {settings['folder']} that were not given, {settings['size']} px: RMSE (one over all "
-        f"photos of a scene, encoded with 1/2.2) and LPIPS v0.1 AlexNet, averaged over scenes. Given is the "
-        f"photo whose light is most central, and that light, {brightness}. Camera at the flash, inverse-square "
-        f"falloff; one exposure per estimate, the median ratio of the given photo to its rendering. Lights are "
-        f"uncertain where their calibration does not call itself {RELIABLE}. Checkpoints "
-        f"{', '.join(settings.get('inits', '?'))}{flips}; seed {settings.get('seed', '?')}; "
+        f"photos of a scene, encoded with 1/2.2) and LPIPS v0.1 AlexNet, averaged over scenes. Given is "
+        f"the photo whose light is most central, and that light, {brightness}. Camera at the flash, "
+        f"inverse-square falloff; one exposure per estimate, the median ratio of the given photo to its "
+        f"rendering. Lights are uncertain where their calibration does not call itself {RELIABLE}. "
+        f"Checkpoints {', '.join(settings.get('inits', '?'))}{flips}; seed {settings.get('seed', '?')}; "
         f"{origin(settings)}."
     )
 
