@@ -14,12 +14,11 @@ import torch
 from torch import Tensor, nn
 
 from losses.reflectance import (
-    encoded_l1,
+    encoded_difference,
     light_l1,
-    log_l1,
+    log_difference,
     map_l1,
     network_maps,
-    parts_l1,
     rendering_log_l1,
     rendering_pair,
     white_from_one,
@@ -103,7 +102,7 @@ class SyntheticObjective:
 
     Attributes:
         maps: within E_i (Eq. 2).
-        normal_l1_factor: of the normals' L1; 1 in the paper.
+        normal_factor: of the normals' L1 and L2; 1 in the paper.
         rendering: within E_ren (Eq. 3).
         rendering_weight: lambda_r; 0 leaves the rendering and its critic out, as the first stage does.
         light_weight: lambda_l.
@@ -118,7 +117,7 @@ class SyntheticObjective:
     """
 
     maps: TermWeights = TermWeights()
-    normal_l1_factor: float = 1.0
+    normal_factor: float = 1.0
     rendering: TermWeights = TermWeights(l1=50.0, perceptual=10.0)
     rendering_weight: float = 5.0
     light_weight: float = 10.0
@@ -150,9 +149,9 @@ class SyntheticObjective:
         seen = random_window(self.window, condition, generator)
         score = Score()
         score.add("light", self.light_weight, light_l1(light.float(), light_to_output(batch.light.position)))
-        for name, distance in parts_l1(parts, truths).items():
-            factor = self.normal_l1_factor if name == "normal" else 1.0
-            score.add(name, self.maps.l1 * factor, distance)
+        for name in MAPS:
+            factor = self.normal_factor if name == "normal" else 1.0
+            score.measure(name, parts[name] - truths[name], self.maps, factor)
             score.judge(
                 name, critics[name], seen(condition), seen(parts[name]), seen(truths[name]), self.maps
             )
@@ -172,13 +171,14 @@ class SyntheticObjective:
     ) -> None:
         lights = self.lights.sample(batch.truth.batch, generator).to(condition.device)
         rendering, reference = rendering_pair(estimate, batch.truth, lights)
-        distance = self._distance(rendering, reference)
+        difference = self._difference(rendering, reference)
         if self.more_lights:
             lights = self.lights.sample(batch.truth.batch * self.more_lights, generator).to(condition.device)
             sparse, truth = (m.map(lambda t: t[..., ::2, ::2]) for m in (estimate, batch.truth))
-            more = self._distance(*rendering_pair(sparse, truth, lights))
-            distance = (distance + self.more_lights * more) / (1 + self.more_lights)
-        score.add("rendering", self.rendering_weight * self.rendering.l1, distance)
+            more = self._difference(*rendering_pair(sparse, truth, lights))
+            # All lights weigh alike: a picture of every second pixel has a quarter of them.
+            difference = torch.cat([difference.flatten(), more.flatten().repeat(4)])
+        score.measure("rendering", difference, self.rendering, self.rendering_weight)
         shown, real = gamma_encode(rendering), gamma_encode(reference)
         score.judge(
             "rendering",
@@ -199,10 +199,10 @@ class SyntheticObjective:
             self.rendering_weight,
         )
 
-    def _distance(self, rendering: Tensor, reference: Tensor) -> Tensor:
+    def _difference(self, rendering: Tensor, reference: Tensor) -> Tensor:
         if self.log_offset:
-            return log_l1(rendering, reference, self.log_offset)
-        return encoded_l1(rendering, reference)
+            return log_difference(rendering, reference, self.log_offset)
+        return encoded_difference(rendering, reference)
 
 
 @dataclass(frozen=True)
@@ -255,7 +255,7 @@ class RealObjective:
         shown, truth = gamma_encode(rendering), gamma_encode(reference)
         seen = random_window(self.window, condition, generator)
         score = Score()
-        score.add("real", self.rendering.l1, encoded_l1(rendering, reference))
+        score.measure("real", encoded_difference(rendering, reference), self.rendering)
         score.judge(
             "real", critics["real"], seen(condition), 2 * seen(shown) - 1, 2 * seen(truth) - 1, self.rendering
         )

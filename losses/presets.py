@@ -27,9 +27,9 @@ compared by VGG too, and E_real weighs as much as E_syn."""
 
 NARROW = HybridObjective(
     synthetic=SyntheticObjective(
-        maps=TermWeights(adversarial=0.05, feature=0.5, l1=1.0),
-        normal_l1_factor=5.0,
-        rendering=TermWeights(adversarial=0.1, feature=1.0, l1=10.0, perceptual=1.0),
+        maps=TermWeights(adversarial=0.05, feature=0.5, l1=1.0, l2=4.0),
+        normal_factor=5.0,
+        rendering=TermWeights(adversarial=0.1, feature=1.0, l1=10.0, perceptual=1.0, l2=20.0),
         rendering_weight=1.0,
         light_weight=1.0,
         more_lights=2,

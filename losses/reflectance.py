@@ -5,8 +5,6 @@ Each is a pure function of tensors. How they are weighted and combined is said i
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -20,12 +18,13 @@ LOG_OFFSET = 0.01
 """Added to linear radiance before the logarithm (Deschaintre et al. 2018, Gao et al. 2019)."""
 
 ENCODING_FLOOR = 1e-3
-"""Radiance below this counts as black in `encoded_l1`: the encoding's slope grows without bound towards 0."""
+"""Radiance below this counts as black in `encoded_difference`, whose slope grows without bound towards 0."""
 
 
 def map_l1(estimate: SVBRDF, truth: SVBRDF) -> dict[str, Float[Tensor, ""]]:
     """Return the mean L1 distance of each map, by name, in the network's range [-1, 1] (Eq. 2)."""
-    return parts_l1(network_maps(estimate), network_maps(truth))
+    found, expected = network_maps(estimate), network_maps(truth)
+    return {name: (found[name] - expected[name]).abs().mean() for name in MAPS}
 
 
 def network_maps(svbrdf: SVBRDF) -> dict[str, Float[Tensor, "b _ h w"]]:
@@ -34,22 +33,26 @@ def network_maps(svbrdf: SVBRDF) -> dict[str, Float[Tensor, "b _ h w"]]:
     return dict(zip(MAPS, parts, strict=True))
 
 
-def parts_l1(estimate: Mapping[str, Tensor], truth: Mapping[str, Tensor]) -> dict[str, Float[Tensor, ""]]:
-    """Return the mean L1 distance of each map of two `network_maps`, by name."""
-    return {name: (estimate[name] - truth[name]).abs().mean() for name in MAPS}
+def log_difference(
+    image: Float[Tensor, "*shape"], reference: Float[Tensor, "*shape"], offset: float = LOG_OFFSET
+) -> Float[Tensor, "*shape"]:
+    """Return `log(image + offset) - log(reference + offset)` of linear radiance >= 0."""
+    return torch.log(image + offset) - torch.log(reference + offset)
+
+
+def encoded_difference(
+    image: Float[Tensor, "*shape"], reference: Float[Tensor, "*shape"]
+) -> Float[Tensor, "*shape"]:
+    """Return the difference of gamma-encoded pictures; radiance above 1 is not clipped here."""
+    encoded, other = (x.clamp(min=ENCODING_FLOOR) ** (1.0 / GAMMA) for x in (image, reference))
+    return encoded - other
 
 
 def log_l1(
     image: Float[Tensor, "*shape"], reference: Float[Tensor, "*shape"], offset: float = LOG_OFFSET
 ) -> Float[Tensor, ""]:
     """Return the mean of `|log(image + offset) - log(reference + offset)|` on linear radiance >= 0."""
-    return (torch.log(image + offset) - torch.log(reference + offset)).abs().mean()
-
-
-def encoded_l1(image: Float[Tensor, "*shape"], reference: Float[Tensor, "*shape"]) -> Float[Tensor, ""]:
-    """Return the mean absolute difference of gamma-encoded pictures; radiance above 1 is not clipped here."""
-    encoded, other = (x.clamp(min=ENCODING_FLOOR) ** (1.0 / GAMMA) for x in (image, reference))
-    return (encoded - other).abs().mean()
+    return log_difference(image, reference, offset).abs().mean()
 
 
 def rendering_pair(

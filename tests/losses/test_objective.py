@@ -13,7 +13,7 @@ from torch import Tensor, nn
 from losses.adversarial import accuracy, discriminator_loss, feature_matching, generator_loss
 from losses.objective import HybridObjective, L1Objective, RealObjective, SyntheticObjective
 from losses.presets import AS_CODED, KINDS, NARROW, PAPER, PRESETS, find_objective, override
-from losses.reflectance import encoded_l1, log_l1, rendering_pair
+from losses.reflectance import encoded_difference, log_l1, rendering_pair
 from losses.score import GAIN_RANGE, Score, TermWeights, build_critics, exposure_gain, random_window
 from losses.vgg import CK17, CONVOLUTIONS, VGGFeatures, perceptual_distance
 from losses.with_vgg import give_vgg, needs_vgg, vgg_distance
@@ -215,28 +215,48 @@ def test_eq_1_adds_up_what_it_says(batch: TrainingBatch, preset: HybridObjective
     terms, maps, shown = numbers(losses.terms), objective.maps, objective.rendering
     expected = objective.light_weight * terms["light"]
     for name in MAPS:
-        l1 = maps.l1 * (objective.normal_l1_factor if name == "normal" else 1.0)
-        expected += l1 * terms[name] + maps.adversarial * terms[f"{name} adversarial"]
+        factor = objective.normal_factor if name == "normal" else 1.0
+        expected += factor * (maps.l1 * terms[name] + maps.l2 * terms.get(f"{name} squared", 0.0))
+        expected += maps.adversarial * terms[f"{name} adversarial"]
         expected += maps.feature * terms[f"{name} features"]
     expected += objective.rendering_weight * (
         shown.adversarial * terms["rendering adversarial"]
         + shown.feature * terms["rendering features"]
         + shown.l1 * terms["rendering"]
+        + shown.l2 * terms.get("rendering squared", 0.0)
         + shown.perceptual * terms["rendering perceptual"]
     )
     assert float(losses.generator.detach()) == pytest.approx(expected, rel=1e-5)
     assert all(math.isfinite(term) and term >= 0.0 for term in terms.values())
+    assert ("normal squared" in terms) == (preset is NARROW)
+
+
+def test_the_median_pleases_l1_and_the_mean_l2() -> None:
+    truth = torch.tensor([0.0, 0.0, 0.0, 1.0])
+    guesses = torch.linspace(0.0, 1.0, 101)
+
+    def best(weights: TermWeights) -> float:
+        sums = []
+        for guess in guesses:
+            score = Score()
+            score.measure("normal", guess - truth, weights)
+            sums.append(sum(score.generator))
+        return float(guesses[int(torch.stack(sums).argmin())])
+
+    assert best(TermWeights(l1=1.0)) == 0.0
+    assert best(TermWeights(l1=0.0, l2=1.0)) == pytest.approx(0.25)
+    assert 0.0 < best(TermWeights(l1=0.1, l2=1.0)) < 0.25
 
 
 def test_the_paper_s_weights() -> None:
     assert HybridObjective() == PAPER
     synthetic, real = PAPER.synthetic, PAPER.real
-    assert synthetic.maps == TermWeights(adversarial=1.0, feature=10.0, l1=10.0, perceptual=0.0)
+    assert synthetic.maps == TermWeights(adversarial=1.0, feature=10.0, l1=10.0, perceptual=0.0, l2=0.0)
     assert synthetic.rendering == TermWeights(adversarial=1.0, feature=10.0, l1=50.0, perceptual=10.0)
     assert (synthetic.rendering_weight, synthetic.light_weight) == (5.0, 10.0)
     assert real.rendering == TermWeights(adversarial=1.0, feature=10.0, l1=50.0, perceptual=0.0)
     assert PAPER.real_weight == 5.0
-    nothing_of_ours = (synthetic.normal_l1_factor, synthetic.more_lights, synthetic.log_offset)
+    nothing_of_ours = (synthetic.normal_factor, synthetic.more_lights, synthetic.log_offset)
     assert nothing_of_ours == (1.0, 0, 0.0)
     assert (synthetic.window, synthetic.perceptual_samples, synthetic.perceptual_layers) == (0, 0, 0)
 
@@ -499,7 +519,7 @@ def test_no_gradient_flows_through_the_exposure(hybrid_batch: TrainingBatch) -> 
     gain = float(exposure_gain(rendering.detach(), hybrid_batch.pairs.b))
     assert gain != pytest.approx(1.0, rel=0.01)
     shown = torch.where(hybrid_batch.pairs.b < 1.0, gain * rendering, (gain * rendering).clamp(max=1.0))
-    encoded_l1(shown, hybrid_batch.pairs.b).backward()
+    encoded_difference(shown, hybrid_batch.pairs.b).abs().mean().backward()
     assert found is not None
     assert leaf.grad is not None
     assert_close(found, leaf.grad, rtol=1e-3, atol=1e-8)
@@ -631,7 +651,7 @@ def test_objectives_by_name() -> None:
         ("l2", "paper", {}, "no objective is called 'l2'; the known ones are l1, synthetic, hybrid"),
         ("hybrid", "soup", {}, "no preset is called 'soup'; the known ones are paper, as_coded, narrow"),
         ("l1", "paper", {"soup": 1.0}, "L1Objective has no 'soup'; it has map_weight"),
-        ("synthetic", "paper", {"maps": {"l2": 1.0}}, "TermWeights has no 'l2'"),
+        ("synthetic", "paper", {"maps": {"l3": 1.0}}, "TermWeights has no 'l3'"),
         ("synthetic", "paper", {"maps": 3.0}, "SyntheticObjective.maps must be of type TermWeights"),
         ("synthetic", "paper", {"window": 1.5}, "window must be of type int, got 1.5"),
         ("synthetic", "paper", {"window": True}, "window must be of type int, got True"),
@@ -654,7 +674,8 @@ def test_objectives_that_cannot_be_are_named(
 def test_objectives_are_plain_data() -> None:
     given = give_vgg(AS_CODED, tiny_vgg())
     data = given.as_dict()
-    assert data["synthetic"]["maps"] == {"adversarial": 0.2, "feature": 2.0, "l1": 10.0, "perceptual": 0.0}
+    maps = {"adversarial": 0.2, "feature": 2.0, "l1": 10.0, "perceptual": 0.0, "l2": 0.0}
+    assert data["synthetic"]["maps"] == maps
     assert data["real"]["camera"]["kind"] == "perspective"
     assert data["synthetic"]["perceptual"] is data["real"]["perceptual"] is None
     assert data == AS_CODED.as_dict()
