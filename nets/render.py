@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from nets.svbrdf import SVBRDF
@@ -129,11 +129,30 @@ def surface_points(
     longer = max(height, width)
 
     def axis(count: int) -> Tensor:
-        index = torch.arange(count, dtype=dtype, device=device) - (count - 1) / 2
-        return index * (2.0 / longer if grid == "centre" else 2.0 / max(longer - 1, 1))
+        return _coordinate(torch.arange(count, device=device), count, longer, grid, dtype)
 
     y, x = torch.meshgrid(-axis(height), axis(width), indexing="ij")
     return torch.stack([x, y, torch.zeros_like(x)])
+
+
+def pixel_points(
+    pixels: Int[Tensor, "*shape"],
+    height: int,
+    width: int,
+    *,
+    grid: Literal["centre", "corner"] = "centre",
+    dtype: torch.dtype = torch.float32,
+) -> Float[Tensor, "3 *shape"]:
+    """Return what `surface_points` says of some pixels, numbered row by row: the same to the bit."""
+    longer = max(height, width)
+    row = torch.div(pixels, width, rounding_mode="floor")
+    x = _coordinate(pixels - row * width, width, longer, grid, dtype)
+    return torch.stack([x, -_coordinate(row, height, longer, grid, dtype), torch.zeros_like(x)])
+
+
+def _coordinate(index: Tensor, count: int, longer: int, grid: str, dtype: torch.dtype) -> Tensor:
+    centred = index.to(dtype) - (count - 1) / 2
+    return centred * (2.0 / longer if grid == "centre" else 2.0 / max(longer - 1, 1))
 
 
 @dataclass(frozen=True)

@@ -5,15 +5,13 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Sequence
 
-import torch
-
-from losses.refinement import photo_distance
-from nets.render import Geometry, shade, shading_geometry, surface_points
 from nets.svbrdf import SVBRDF
+from refine.bands import distance_in_bands
 from refine.capture import Capture
-from refine.engine import choose_engine, find_descend
+from refine.engine import choose_engine, find_descend, find_solve
+from refine.engine.reference import Progress
 from refine.parametrization import Parameters
-from refine.stages import Recipe
+from refine.stages import PosteriorStage, Recipe, Stage
 
 Report = Callable[[str, int, int, float], None]
 """Progress: stage name, iteration (from 1), iterations of all stages, loss."""
@@ -46,46 +44,45 @@ def run_stages(
         ValueError: a light is missing.
     """
     photos = [captures] if isinstance(captures, Capture) else list(captures)
-    height, width = initial.size
     device = initial.normal.device
-    geometries = [_geometry(capture, height, width) for capture in photos]
-    with torch.no_grad():
-        start = sum(
-            float(photo_distance(shade(initial, geometry), capture.photo, capture.unsaturated))
-            for capture, geometry in zip(photos, geometries, strict=True)
-        )
-    losses = {"initialization": [start]}
+    losses = {"initialization": [sum(distance_in_bands(initial, capture) for capture in photos)]}
     if recipe.iterations == 0:
         return initial, losses
-    descend = find_descend(choose_engine(engine, device.type))
+    engine = choose_engine(engine, device.type)
     parameters = Parameters.from_svbrdf(initial)
     finished = 0
     for stage in recipe.stages:
         clock = time.perf_counter()
         count = sum(name.split(" ")[0] == stage.name for name in losses)
         label = f"{stage.name} {count + 1}" if count else stage.name
-        offsets = {name: zero.to(device) for name, zero in stage.offsets(height, width).items()}
 
         def tell(iteration: int, loss: float, name: str = label, before: int = finished) -> None:
             if progress is not None:
                 progress(name, before + iteration, recipe.iterations, loss)
 
-        parameters, losses[label] = descend(
-            parameters,
-            offsets,
-            photos,
-            geometries,
-            iterations=stage.iterations,
-            rates=stage.rates.moving(),
-            progress=tell,
-        )
+        parameters, losses[label] = _run_stage(stage, parameters, photos, tell, engine)
         finished += stage.iterations
         seconds[label] = time.perf_counter() - clock
     return parameters.svbrdf(), losses
 
 
-def _geometry(capture: Capture, height: int, width: int) -> Geometry:
-    if capture.light is None:
-        raise ValueError("the light of a photo is not known; fit it or give it before the stages run")
-    points = surface_points(height, width, device=capture.photo.device)
-    return shading_geometry(points, capture.light, capture.camera)
+def _run_stage(
+    stage: Stage, start: Parameters, photos: Sequence[Capture], tell: Progress, engine: str
+) -> tuple[Parameters, list[float]]:
+    if isinstance(stage, PosteriorStage):
+        posterior = find_solve(engine)(
+            start,
+            photos,
+            iterations=stage.iterations,
+            widths=stage.widths.moving(),
+            noise=stage.noise,
+            huber=stage.huber,
+            progress=tell,
+        )
+        return posterior.parameters, posterior.history
+    height, width = start.normal.shape[-2:]
+    offsets = {name: zero.to(start.normal.device) for name, zero in stage.offsets(height, width).items()}
+    descended: tuple[Parameters, list[float]] = find_descend(engine)(
+        start, offsets, photos, iterations=stage.iterations, rates=stage.rates.moving(), progress=tell
+    )
+    return descended

@@ -2,7 +2,8 @@
 
 Pixels that move by their own gradient do not depend on each other, so each block of them runs through *all*
 iterations while it stays in the first level of cache (`kernel.py`); nothing but parameters and loss sums ever
-reaches memory. Offsets that all pixels share need one pass and one small sum per iteration.
+reaches memory. Offsets that all pixels share need one pass and one small sum per iteration, over no more
+pixels than make the mean gradient certain.
 
 The results do not depend on the number of threads: blocks are fixed, and their sums are added in their order.
 """
@@ -35,14 +36,19 @@ from refine.engine.workers import Workers
 from refine.parametrization import Parameters
 
 SPAN_BLOCKS = 1024
-"""Blocks that are packed, run and unpacked together: 65,536 pixels, some 15 MB in float32."""
+"""Blocks that are dealt out to the threads together: 65,536 pixels. Each thread packs, runs and unpacks the
+parts it gets, which are small enough for torch to compute their geometry without threads of its own: how it
+divides the work among them shows in the last bits."""
+
+SHARED_PIXELS = 2**18
+"""Most pixels that offsets shared by all of them are found from; of a larger photo, as many are drawn."""
 
 
 def descend(
     start: Parameters,
     offsets: dict[str, Tensor],
     capture: Capture | Sequence[Capture],
-    geometry: Geometry | Sequence[Geometry],
+    geometry: Geometry | Sequence[Geometry] | None = None,
     *,
     iterations: int,
     rates: dict[str, float],
@@ -52,26 +58,26 @@ def descend(
     """Minimise the photo's distance as `refine.engine.reference.descend` does, which see.
 
     Unlike there, offsets are either all full-size or all `[1, C, 1, 1]`, and `progress` is told in bursts: of
-    photos of more than one span, with losses over the pixels that are finished.
+    photos of more than one span, with losses over the pixels that are finished. Offsets that all pixels share
+    are found from `SHARED_PIXELS` of them, and their losses are over these.
 
     Raises:
         ValueError: for tensors off the CPU or of another type than float32 and float64, or mixed offsets.
     """
-    problem = _problem(start, capture, geometry, conventions)
+    problem = fused_problem(start, capture, geometry, conventions)
     own = {offset.shape[-2:] == start.normal.shape[-2:] for offset in offsets.values()}
     if len(own) != 1:
         raise ValueError("offsets must be all per pixel or all shared by the pixels")
     steps = _steps(iterations, rates)
     run = _descend_pixels if own.pop() else _descend_together
     with Workers.of_torch() as workers:
-        found, history = run(problem, offsets, steps, workers, progress)
-    return start.shifted(found), history
+        return run(problem, offsets, steps, workers, progress)
 
 
 def distance_and_gradients(
     start: Parameters,
     capture: Capture | Sequence[Capture],
-    geometry: Geometry | Sequence[Geometry],
+    geometry: Geometry | Sequence[Geometry] | None = None,
     conventions: Conventions = PAPER,
 ) -> tuple[float, dict[str, Float[Tensor, "1 c h w"]]]:
     """Return the distance, and by map name the gradient of every pixel's own distance by its parameters.
@@ -79,7 +85,7 @@ def distance_and_gradients(
     It is one step of the descent, of rate -1 and without memory, with which clipped pixels move, too: there
     is no second implementation that could differ.
     """
-    problem = _problem(start, capture, geometry, conventions)
+    problem = fused_problem(start, capture, geometry, conventions)
     problem = replace(problem, moves=torch.ones_like(problem.moves))
     zeros = {name: torch.zeros_like(getattr(start, name)) for name in MAPS}
     # offset -= rate first / (sqrt(second) correction + epsilon), with first = gradient
@@ -90,57 +96,100 @@ def distance_and_gradients(
 
 
 @dataclass(frozen=True)
-class _Problem:
+class Problem:
     """What is fixed during a descent."""
 
     start: Parameters
     captures: list[Capture]
-    geometries: list[Geometry]
+    geometries: list[layout.GeometryAt]
     moves: Bool[Tensor, "1 1 h w"]
     constants: Float[np.ndarray, "constants"]
 
     @property
     def real(self) -> np.dtype:
+        """Type of the numbers."""
         return self.constants.dtype
 
     @property
     def pixels(self) -> int:
+        """How many there are."""
         return self.moves.numel()
 
-    def spans(self, blocks: int = SPAN_BLOCKS) -> list[slice]:
-        size = blocks * kernel.BLOCK
+    def spans(self) -> list[slice]:
+        """Cut the pixels into ranges that are packed together."""
+        size = SPAN_BLOCKS * kernel.BLOCK
         return [slice(first, min(first + size, self.pixels)) for first in range(0, self.pixels, size)]
 
-    def pack(self, offsets: dict[str, Tensor], span: slice) -> _Packed:
-        return _Packed(
-            layout.pack_surface(self.start, offsets, self.moves, span),
-            layout.pack_photos(self.captures, self.geometries, span, self.start.normal.dtype),
-            layout.count_pixels(span),
+    def drawn(self) -> Problem:
+        """Return this problem on `SHARED_PIXELS` or somewhat fewer, if it has more.
+
+        They are one pixel of every run of so many, at a place drawn from a fixed seed: an even distance
+        would see the same thread of every stitch.
+        """
+        run = -(-self.pixels // SHARED_PIXELS)
+        if run == 1:
+            return self
+        begin = torch.arange(0, self.pixels - run + 1, run)
+        chosen = (begin + torch.randint(run, begin.shape, generator=torch.Generator().manual_seed(0)))[None]
+
+        def choose(tensor: Tensor) -> Tensor:
+            return layout.at_pixels(tensor, chosen)
+
+        def geometry_at(whole: layout.GeometryAt) -> layout.GeometryAt:
+            return lambda pixels: whole(chosen[:, pixels[0]])
+
+        return Problem(
+            Parameters(*(choose(getattr(self.start, name)) for name in MAPS)),
+            [replace(c, photo=choose(c.photo), unsaturated=choose(c.unsaturated)) for c in self.captures],
+            [geometry_at(whole) for whole in self.geometries],
+            choose(self.moves),
+            self.constants,
+        )
+
+    def pack(self, offsets: dict[str, Tensor], pixels: slice) -> Packed:
+        """Pack a range of pixels for the compiled loops."""
+        return Packed(
+            pixels,
+            layout.pack_surface(self.start, offsets, self.moves, pixels),
+            layout.pack_photos(self.captures, self.geometries, pixels, self.start.normal.dtype),
+            layout.count_pixels(pixels),
         )
 
 
 @dataclass(frozen=True)
-class _Packed:
-    """A span of pixels as the compiled loops read it."""
+class Packed:
+    """A range of pixels as the compiled loops read it."""
 
+    pixels: slice
     surface: Float[np.ndarray, "blocks surface"]
     photos: Float[np.ndarray, "blocks photos"]
     counts: Int[np.ndarray, "blocks"]
 
 
-def _problem(
+def fused_problem(
     start: Parameters,
     capture: Capture | Sequence[Capture],
-    geometry: Geometry | Sequence[Geometry],
+    geometry: Geometry | Sequence[Geometry] | None,
     conventions: Conventions,
-) -> _Problem:
-    captures, geometries = several(capture, geometry)
+) -> Problem:
+    """Return what a fused engine works on.
+
+    Raises:
+        ValueError: for tensors off the CPU or of another type than float32 and float64.
+    """
     dtype, device = start.normal.dtype, start.normal.device
     if device.type != "cpu" or dtype not in (torch.float32, torch.float64):
         raise ValueError(f"the fused engine takes float32 or float64 on the CPU, not {dtype} on {device}")
+    if geometry is None:
+        captures = [capture] if isinstance(capture, Capture) else list(capture)
+        size = (start.normal.shape[-2], start.normal.shape[-1])
+        geometries = [layout.computed_geometry(photo, size, conventions, dtype) for photo in captures]
+    else:
+        captures, given = several(capture, geometry)
+        geometries = [layout.given_geometry(whole) for whole in given]
     prepare(dtype)
     constants = layout.constants(conventions, dtype)
-    return _Problem(start, captures, geometries, unsaturated_somewhere(captures), constants)
+    return Problem(start, captures, geometries, unsaturated_somewhere(captures), constants)
 
 
 def _steps(iterations: int, rates: dict[str, float]) -> Float[np.ndarray, "iterations numbers"]:
@@ -161,12 +210,12 @@ def _best(history: list[float]) -> int:
 
 
 def _descend_pixels(
-    problem: _Problem,
+    problem: Problem,
     offsets: dict[str, Tensor],
     steps: Float[np.ndarray, "iterations numbers"],
     workers: Workers,
     progress: Progress | None,
-) -> tuple[dict[str, Tensor], list[float]]:
+) -> tuple[Parameters, list[float]]:
     steps = steps.copy()
     still = [name for name in MAPS if name not in offsets]
     for name in still:
@@ -175,11 +224,13 @@ def _descend_pixels(
     if (best := _best(history)) < len(steps):
         # Pixels do not know of each other, so only now is it known when to stop: go there again.
         found, _ = _run_pixels(problem, offsets, steps[:best], ADAM_BETAS, workers, None)
-    return found, history
+    # In place, since a photo may be large.
+    moved = {name: offset.add_(getattr(problem.start, name)) for name, offset in found.items()}
+    return replace(problem.start, **moved), history
 
 
 def _run_pixels(
-    problem: _Problem,
+    problem: Problem,
     offsets: dict[str, Tensor],
     steps: Float[np.ndarray, "iterations numbers"],
     betas: tuple[float, float],
@@ -189,27 +240,27 @@ def _run_pixels(
     real, count = problem.real, len(steps)
     steps_, betas_ = steps.astype(real), np.array([1.0 - betas[0], betas[1], 1.0 - betas[1]], dtype=real)
     shared = np.zeros(kernel.PARAMETERS, dtype=real)
-    found = {name: torch.empty_like(offset) for name, offset in offsets.items()}
+    found = {name: offset.new_empty(offset.shape) for name, offset in offsets.items()}
     total, finished, told = np.zeros(count + 1), 0, 0
     for span in problem.spans():
-        packed = problem.pack(offsets, span)
-        losses = np.empty((len(packed.counts), count + 1))
+        losses = np.empty((layout.count_blocks(span), count + 1))
 
-        def work(part: slice, packed: _Packed = packed, losses: np.ndarray = losses) -> None:
+        def work(part: slice, span: slice = span, losses: np.ndarray = losses) -> None:
+            packed = problem.pack(offsets, layout.pixels_of(part, span))
             kernel.descend_blocks(
-                packed.surface[part],
-                packed.photos[part],
+                packed.surface,
+                packed.photos,
                 shared,
                 problem.constants,
                 betas_,
                 steps_,
                 layout.scratch(real),
-                packed.counts[part],
+                packed.counts,
                 losses[part],
             )
+            layout.unpack_offsets(packed.surface, packed.pixels, found)
 
-        workers.run(work, len(packed.counts))
-        layout.unpack_offsets(packed.surface, span, found)
+        workers.run(work, len(losses))
         total += losses.sum(axis=0)
         finished = span.stop
         mark = count * finished // problem.pixels
@@ -220,16 +271,29 @@ def _run_pixels(
     return found, [float(loss) / (3 * problem.pixels) for loss in total]
 
 
+def _pack_spans(problem: Problem, workers: Workers) -> list[Packed]:
+    """Pack all pixels, in parts of a span as `_run_pixels` does."""
+    packed: list[Packed] = []
+    for span in problem.spans():
+
+        def work(part: slice, span: slice = span) -> None:
+            packed.append(problem.pack({}, layout.pixels_of(part, span)))
+
+        workers.run(work, layout.count_blocks(span))
+    return packed
+
+
 def _descend_together(
-    problem: _Problem,
+    whole: Problem,
     offsets: dict[str, Tensor],
     steps: Float[np.ndarray, "iterations numbers"],
     workers: Workers,
     progress: Progress | None,
-) -> tuple[dict[str, Tensor], list[float]]:
+) -> tuple[Parameters, list[float]]:
+    problem = whole.drawn()
     real = problem.real
-    packed = problem.pack({}, slice(0, problem.pixels))
-    sums = np.empty((len(packed.counts), kernel.PARAMETERS + 1))
+    packed = _pack_spans(problem, workers)
+    sums = np.empty((sum(len(part.counts) for part in packed), kernel.PARAMETERS + 1))
     shared = np.zeros(kernel.PARAMETERS)
     moving = np.zeros(kernel.PARAMETERS, dtype=bool)
     for name, offset in offsets.items():
@@ -243,18 +307,20 @@ def _descend_together(
         nonlocal lowest
         now = shared.astype(real)
 
-        def work(part: slice) -> None:
-            kernel.sum_blocks(
-                packed.surface[part],
-                packed.photos[part],
-                now,
-                problem.constants,
-                layout.scratch(real),
-                packed.counts[part],
-                sums[part],
-            )
+        def work(parts: slice) -> None:
+            for part in packed[parts]:
+                first = part.pixels.start // kernel.BLOCK
+                kernel.sum_blocks(
+                    part.surface,
+                    part.photos,
+                    now,
+                    problem.constants,
+                    layout.scratch(real),
+                    part.counts,
+                    sums[first : first + len(part.counts)],
+                )
 
-        workers.run(work, len(packed.counts))
+        workers.run(work, len(packed))
         total = sums.sum(axis=0)
         history.append(float(total[-1]) / (3 * problem.pixels))
         if history[-1] < lowest:  # the first of the lowest, as the reference has it; never NaN
@@ -272,4 +338,4 @@ def _descend_together(
     found = {}
     for name, offset in offsets.items():
         found[name] = torch.from_numpy(best[layout.ROWS[name]]).to(offset.dtype).reshape(offset.shape)
-    return found, history
+    return whole.start.shifted(found), history

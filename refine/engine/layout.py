@@ -1,11 +1,13 @@
 """How the fused engine packs tensors for its compiled loops (`kernel.py`): blocks of pixels, rows of numbers.
 
-Only a span of pixels is packed at a time, so that what is packed stays small however large the photo is.
+Only a span of pixels is packed at a time, so that what is packed stays small however large the photo is; and
+only for them it is computed how they are lit and seen.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import fields
 
 import numpy as np
 import torch
@@ -15,6 +17,7 @@ from torch import Tensor
 from losses.reflectance import LOG_OFFSET
 from nets.render import Conventions, Geometry
 from nets.svbrdf import MAPS
+from refine.bands import pixel_geometry
 from refine.capture import Capture
 from refine.engine import kernel
 from refine.parametrization import ALBEDO_RANGE, ROUGHNESS_RANGE, SLOPE_SCALE, Parameters
@@ -27,6 +30,9 @@ OUT_OF_REACH = 1e30
 
 Span = slice
 """A range of pixels in row order; it begins at a multiple of `kernel.BLOCK`."""
+
+GeometryAt = Callable[[Int[Tensor, "1 pixels"]], Geometry]
+"""From pixels, numbered in row order, to their shading geometry, `[1, C, 1, pixels]`."""
 
 
 def constants(conventions: Conventions, dtype: torch.dtype) -> Float[np.ndarray, "9"]:
@@ -53,6 +59,17 @@ def numpy_type(dtype: torch.dtype) -> np.dtype:
     return np.dtype(str(dtype).removeprefix("torch."))
 
 
+def count_blocks(span: Span) -> int:
+    """Return how many blocks a range of pixels fills, the last perhaps in part."""
+    return -(-(span.stop - span.start) // kernel.BLOCK)
+
+
+def pixels_of(blocks: slice, span: Span) -> Span:
+    """Return the pixels of some blocks of a span."""
+    first, end = (span.start + place * kernel.BLOCK for place in (blocks.start, blocks.stop))
+    return slice(first, min(end, span.stop))
+
+
 def count_pixels(span: Span) -> Int[np.ndarray, "blocks"]:
     """Return how many pixels of each block are no padding."""
     starts = np.arange(span.start, span.stop, kernel.BLOCK, dtype=np.int64)
@@ -62,6 +79,31 @@ def count_pixels(span: Span) -> Int[np.ndarray, "blocks"]:
 def scratch(real: np.dtype) -> Float[np.ndarray, "numbers"]:
     """Return what one thread needs besides the blocks it works on."""
     return np.empty(kernel.SCRATCH_ROWS * kernel.BLOCK, dtype=real)
+
+
+def given_geometry(geometry: Geometry) -> GeometryAt:
+    """Return the geometry of any pixels of a photo from that of all of them."""
+
+    def at(pixels: Int[Tensor, "1 pixels"]) -> Geometry:
+        return Geometry(*(at_pixels(getattr(geometry, field.name), pixels) for field in fields(Geometry)))
+
+    return at
+
+
+def computed_geometry(
+    capture: Capture, size: tuple[int, int], conventions: Conventions, dtype: torch.dtype
+) -> GeometryAt:
+    """Return the geometry of any pixels of a photo from its light and camera."""
+
+    def at(pixels: Int[Tensor, "1 pixels"]) -> Geometry:
+        return pixel_geometry(pixels, size, capture.light, capture.camera, conventions, dtype)
+
+    return at
+
+
+def at_pixels(tensor: Tensor, pixels: Int[Tensor, "1 n"]) -> Tensor:
+    """Return `[1, C, 1, n]` of a map `[1, C, H, W]`, or one value per channel `[1, C, 1, 1]` as it is."""
+    return tensor if tensor.shape[-2:] == (1, 1) else tensor.flatten(2)[..., pixels]
 
 
 def pack_surface(
@@ -87,12 +129,13 @@ def pack_surface(
 
 
 def pack_photos(
-    captures: Sequence[Capture], geometries: Sequence[Geometry], span: Span, dtype: torch.dtype
+    captures: Sequence[Capture], geometries: Sequence[GeometryAt], span: Span, dtype: torch.dtype
 ) -> Float[np.ndarray, "blocks numbers"]:
     """Pack photos with the geometry of their lights and cameras, side by side within each block."""
+    pixels = torch.arange(span.start, span.stop)[None]
     packed = np.concatenate(
         [
-            _pack_photo(capture, geometry, span, dtype)
+            _pack_photo(capture, geometry(pixels), span, dtype)
             for capture, geometry in zip(captures, geometries, strict=True)
         ],
         axis=1,
@@ -102,7 +145,12 @@ def pack_photos(
 
 def unpack_offsets(surface: Float[np.ndarray, "blocks numbers"], span: Span, into: dict[str, Tensor]) -> None:
     """Write the offsets of a span of pixels into full-size tensors `[1, C, H, W]`, by map name."""
-    blocks = surface.reshape(len(surface), -1, kernel.BLOCK)[:, kernel.OFFSET :]
+    unpack(surface[:, kernel.OFFSET * kernel.BLOCK :], span, into)
+
+
+def unpack(parameters: Float[np.ndarray, "blocks numbers"], span: Span, into: dict[str, Tensor]) -> None:
+    """Write rows of all parameters of a span of pixels into full-size tensors `[1, C, H, W]`, by map name."""
+    blocks = parameters.reshape(len(parameters), -1, kernel.BLOCK)
     size = span.stop - span.start
     for name, tensor in into.items():
         pixels = blocks[:, ROWS[name]].transpose(1, 0, 2).reshape(tensor.shape[1], -1)[:, :size]
@@ -113,11 +161,12 @@ def _pack_photo(
     capture: Capture, geometry: Geometry, span: Span, dtype: torch.dtype
 ) -> Float[np.ndarray, "blocks rows block"]:
     blocks = _blocks(kernel.PHOTO_ROWS, span, dtype)
-    _fill(blocks, kernel.LIGHT, geometry.light_direction, span)
-    _fill(blocks, kernel.VIEW, geometry.view, span)
-    _fill(blocks, kernel.HALF, geometry.half_vector, span)
-    _fill(blocks, kernel.FRESNEL, geometry.fresnel_weight, span)
-    _fill(blocks, kernel.IRRADIANCE, geometry.irradiance, span)
+    packed = slice(0, span.stop - span.start)
+    _fill(blocks, kernel.LIGHT, geometry.light_direction, packed)
+    _fill(blocks, kernel.VIEW, geometry.view, packed)
+    _fill(blocks, kernel.HALF, geometry.half_vector, packed)
+    _fill(blocks, kernel.FRESNEL, geometry.fresnel_weight, packed)
+    _fill(blocks, kernel.IRRADIANCE, geometry.irradiance, packed)
     _fill(blocks, kernel.TARGET, capture.photo, span)
     blocks[:, kernel.TARGET : kernel.CEILING] += blocks.dtype.type(LOG_OFFSET)
     _fill(blocks, kernel.CEILING, capture.unsaturated, span)
@@ -127,19 +176,21 @@ def _pack_photo(
 
 
 def _blocks(rows: int, span: Span, dtype: torch.dtype) -> Float[np.ndarray, "blocks rows block"]:
-    count = -(-(span.stop - span.start) // kernel.BLOCK)
-    return np.zeros((count, rows, kernel.BLOCK), dtype=numpy_type(dtype))
+    return np.zeros((count_blocks(span), rows, kernel.BLOCK), dtype=numpy_type(dtype))
 
 
 def _fill(blocks: Float[np.ndarray, "blocks rows block"], row: int, tensor: Tensor, span: Span) -> None:
     # A map `[1, C, H, W]`, or one value per channel `[1, C, 1, 1]`, to the rows from `row` on.
     channels, size = tensor.shape[1], span.stop - span.start
     rows = blocks[:, row : row + channels]
-    flat = tensor.detach().reshape(channels, -1)
-    if flat.shape[1] == 1:
-        rows[:] = flat.numpy()
+    if tensor.shape[-2:] == (1, 1):
+        rows[:] = tensor.detach().reshape(channels, 1).numpy()
         return
-    pixels = flat[:, span].numpy()
+    # Only the image's rows that hold the span: a map may be one value expanded over all pixels.
+    width = tensor.shape[-1]
+    top = span.start // width
+    flat = tensor.detach()[0, :, top : -(-span.stop // width)].reshape(channels, -1)
+    pixels = flat[:, span.start - top * width : span.stop - top * width].numpy()
     whole = size // kernel.BLOCK * kernel.BLOCK
     full = pixels[:, :whole].reshape(channels, -1, kernel.BLOCK)
     rows[: len(rows) if whole == size else -1] = full.transpose(1, 0, 2)

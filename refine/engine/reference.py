@@ -11,6 +11,7 @@ from torch import Tensor
 
 from losses.refinement import photo_distance
 from nets.render import PAPER, Conventions, Geometry, shade
+from refine.bands import photo_geometry
 from refine.capture import Capture
 from refine.parametrization import Parameters
 
@@ -32,7 +33,7 @@ def descend(
     start: Parameters,
     offsets: dict[str, Tensor],
     capture: Capture | Sequence[Capture],
-    geometry: Geometry | Sequence[Geometry],
+    geometry: Geometry | Sequence[Geometry] | None = None,
     *,
     iterations: int,
     rates: dict[str, float],
@@ -46,7 +47,7 @@ def descend(
         offsets: zero tensors to optimise, by map name. Full-size ones move every pixel by its own
             gradient; `[1, C, 1, 1]` ones move all pixels by the gradient averaged over all of them.
         capture: the photo to explain, or several of the same surface, whose distances add.
-        geometry: of the light and camera of each photo, fixed.
+        geometry: of the light and camera of each photo, fixed; by default what the photos say of them.
         iterations: Adam steps.
         rates: Adam's learning rate by map name, decayed along a quarter cosine to `FINAL_RATE` of it.
         conventions: of the renderer.
@@ -55,7 +56,7 @@ def descend(
     Returns:
         The parameters with the lowest loss seen, and the loss before every step and after the last.
     """
-    captures, geometries = several(capture, geometry)
+    captures, geometries = several(capture, geometry, conventions)
     moving = {name: offset.detach().clone().requires_grad_(True) for name, offset in offsets.items()}
     # The gradient of a pixel's own distance, or its average over all pixels where they share one offset.
     own_pixels = max(offset.shape[-2] * offset.shape[-1] for offset in offsets.values())
@@ -107,14 +108,18 @@ def descend(
 
 
 def several(
-    capture: Capture | Sequence[Capture], geometry: Geometry | Sequence[Geometry]
+    capture: Capture | Sequence[Capture],
+    geometry: Geometry | Sequence[Geometry] | None,
+    conventions: Conventions = PAPER,
 ) -> tuple[list[Capture], list[Geometry]]:
     """Return photos and their geometries as lists of one length, of which each may be given alone.
 
     Raises:
-        ValueError: if there are not as many geometries as photos, or none.
+        ValueError: if there are not as many geometries as photos, or none; or no geometry and no light.
     """
     captures = [capture] if isinstance(capture, Capture) else list(capture)
+    if geometry is None:
+        geometry = [photo_geometry(photo, conventions) for photo in captures]
     geometries = [geometry] if isinstance(geometry, Geometry) else list(geometry)
     if not captures or len(captures) != len(geometries):
         raise ValueError(f"{len(captures)} photos and {len(geometries)} geometries do not make pairs")
