@@ -14,6 +14,7 @@ import typer
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
+from eval.ablations import ablation_estimator
 from eval.datasets import NOVEL_LIGHTS, SIZE, Protocol, spread
 from eval.development import (
     DEVELOPMENT,
@@ -100,6 +101,30 @@ def development(
         "flips": flips,
         **about,
     }
+    _finish(results, markdown(results), json_file, markdown_file)
+
+
+@main.command()
+def ablations(
+    data: Data,
+    init: Checkpoint = "default",
+    scenes: Scenes = None,
+    lights: Annotated[int, typer.Option(min=1, help="Novel lights per scene.")] = NOVEL_LIGHTS,
+    threads: Threads = 0,
+    json_file: JsonFile = None,
+    markdown_file: MarkdownFile = None,
+) -> None:
+    """Score the default recipe with each of its ingredients taken away, on the development sets."""
+    _use_threads(threads)
+    with _mistakes():
+        require(data, DEVELOPMENT)
+        refiner = Refiner(init)
+
+    about = provenance()
+    with _progress(count_scenes(data, DEVELOPMENT, scenes)) as tell:
+        protocol = Protocol(lights=lights)
+        results = evaluate(ablation_estimator(refiner), data, DEVELOPMENT, protocol, scenes, LPIPS(), tell)
+    results.settings |= {"init": init, "recipe": "ablations of default", **about}
     _finish(results, markdown(results), json_file, markdown_file)
 
 

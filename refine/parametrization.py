@@ -11,7 +11,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from nets.svbrdf import MAPS, SVBRDF
+from nets.svbrdf import CHANNELS, MAPS, SVBRDF
 
 SLOPE_SCALE = 0.25
 """Slope of one unit of a normal parameter: makes one step move normals about as visibly as albedo."""
@@ -25,6 +25,10 @@ ROUGHNESS_RANGE = (0.03, 1.0)
 
 LOGIT_MARGIN = 2e-3
 """Values closer to the ends of their range than this share of it start this far from them."""
+
+
+PARAMETER_COUNTS = {**CHANNELS, "normal": 2}
+"""Free numbers per pixel of each map: a unit normal has two, its slopes."""
 
 
 @dataclass(frozen=True)

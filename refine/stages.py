@@ -7,8 +7,9 @@ from typing import Any
 
 import torch
 
-from nets.svbrdf import CHANNELS, MAPS
+from nets.svbrdf import MAPS
 from refine.light import LightFit
+from refine.parametrization import PARAMETER_COUNTS
 
 LARGEST_SPEEDUP = 6.0
 """Most that rates are raised when a recipe is asked for fewer iterations than its own."""
@@ -44,9 +45,13 @@ class GlobalStage:
         """How logs and files call this stage."""
         return "global"
 
+    def scaled(self, iterations: int, pace: float) -> GlobalStage:
+        """Return this stage with other iterations, and rates times a pace."""
+        return replace(self, iterations=iterations, rates=self.rates.scaled(pace))
+
     def offsets(self, height: int, width: int) -> dict[str, torch.Tensor]:
         """Return the zero offsets that this stage optimises: one per channel."""
-        return {name: torch.zeros(1, _parameters(name), 1, 1) for name in self.rates.moving()}
+        return {name: torch.zeros(1, PARAMETER_COUNTS[name], 1, 1) for name in self.rates.moving()}
 
 
 @dataclass(frozen=True)
@@ -61,12 +66,56 @@ class PixelStage:
         """How logs and files call this stage."""
         return "per-pixel"
 
+    def scaled(self, iterations: int, pace: float) -> PixelStage:
+        """Return this stage with other iterations, and rates times a pace."""
+        return replace(self, iterations=iterations, rates=self.rates.scaled(pace))
+
     def offsets(self, height: int, width: int) -> dict[str, torch.Tensor]:
         """Return the zero offsets that this stage optimises: one per channel and pixel."""
-        return {name: torch.zeros(1, _parameters(name), height, width) for name in self.rates.moving()}
+        return {name: torch.zeros(1, PARAMETER_COUNTS[name], height, width) for name in self.rates.moving()}
 
 
-Stage = GlobalStage | PixelStage
+@dataclass(frozen=True)
+class Widths:
+    """Standard deviation of a prior on each map's parameters, see `refine.parametrization`; 0 keeps a map."""
+
+    normal: float = 0.0
+    diffuse: float = 0.0
+    roughness: float = 0.0
+    specular: float = 0.0
+
+    def moving(self) -> dict[str, float]:
+        """Return the widths that are not zero, by map name."""
+        return {name: width for name in MAPS if (width := getattr(self, name)) > 0.0}
+
+
+@dataclass(frozen=True)
+class PosteriorStage:
+    """Find every pixel's most probable parameters by damped Gauss-Newton, see `refine.engine.gauss_newton`.
+
+    Attributes:
+        iterations: steps; it has converged after a handful.
+        widths: of the prior around what the stage before it left.
+        noise: standard deviation of the logarithm of radiance that the maps do not explain.
+        huber: residuals beyond this many deviations count linearly.
+    """
+
+    iterations: int = 6
+    widths: Widths = Widths(normal=0.12, diffuse=0.2, roughness=0.03, specular=0.14)
+    noise: float = 0.03
+    huber: float = 3.0
+
+    @property
+    def name(self) -> str:
+        """How logs and files call this stage."""
+        return "posterior"
+
+    def scaled(self, iterations: int, pace: float) -> PosteriorStage:
+        """Return this stage with other iterations; a solver that has converged does not go faster."""
+        return replace(self, iterations=iterations)
+
+
+Stage = GlobalStage | PixelStage | PosteriorStage
 
 
 @dataclass(frozen=True)
@@ -102,7 +151,7 @@ class Recipe:
         pace = min(LARGEST_SPEEDUP, ends[-1] / max(1, total))
         marks = [round(end * total / max(1, ends[-1])) for end in ends]
         stages = tuple(
-            replace(stage, iterations=after - before, rates=stage.rates.scaled(pace))
+            stage.scaled(after - before, pace)
             for stage, before, after in zip(self.stages, marks[:-1], marks[1:], strict=True)
         )
         return replace(self, stages=stages)
@@ -116,10 +165,16 @@ class Recipe:
         }
 
 
+LONG_GLOBAL = GlobalStage(160, Rates(diffuse=0.02, roughness=0.01, specular=0.02))
+"""Of the `default` recipe: the diffuse takes part, or its error would be left to roughness and specular."""
+
 RECIPES: dict[str, Recipe] = {
+    "default": Recipe("default", stages=(LONG_GLOBAL, PosteriorStage())),
     "paper": Recipe("paper", stages=(GlobalStage(), PixelStage())),
+    "fast": Recipe("fast", light_fit=None, stages=(PosteriorStage(iterations=3),)),
 }
-"""By name. `paper` is Ours+ of Table 1: global roughness and specular, then every map per pixel."""
+"""By name. `default` is the best there is. `paper` is Ours+ of Table 1: global roughness and specular, then
+every map per pixel. `fast` believes the light head and takes three steps: real time."""
 
 
 def find_recipe(name: str) -> Recipe:
@@ -131,8 +186,3 @@ def find_recipe(name: str) -> Recipe:
     if name not in RECIPES:
         raise ValueError(f"no recipe is called {name!r}; the known ones are {', '.join(sorted(RECIPES))}")
     return RECIPES[name]
-
-
-def _parameters(name: str) -> int:
-    # A unit normal has two free numbers, its slopes.
-    return 2 if name == "normal" else CHANNELS[name]

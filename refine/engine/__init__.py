@@ -36,3 +36,10 @@ def find_descend(name: str) -> Callable[..., Any]:
     """Return the `descend` of an engine, see `refine.engine.reference.descend`."""
     descend: Callable[..., Any] = import_module(ENGINES[name]).descend
     return descend
+
+
+def find_solve(name: str) -> Callable[..., Any]:
+    """Return the `solve` that goes with an engine, see `refine.engine.gauss_newton.solve`."""
+    module = "fused_gauss_newton" if name == "fused" else "gauss_newton"
+    solve: Callable[..., Any] = import_module(f"refine.engine.{module}").solve
+    return solve

@@ -4,41 +4,52 @@ from __future__ import annotations
 
 import logging
 import threading
+from types import ModuleType
 from typing import Any
 
 import numba
 import torch
 from numba.core import event
 
-from refine.engine import kernel, layout, simd
+from refine.engine import kernel, layout, newton_step, simd
 
 COMPILING = "compiling the refinement for this processor; this happens once and takes some ten seconds"
 
 _log = logging.getLogger(__name__)
 
 
-def prepare(dtype: torch.dtype = torch.float32) -> None:
+def prepare(dtype: torch.dtype = torch.float32, *names: str) -> None:
     """Compile for float32 or float64, or load what was compiled before; the log says if it has to compile.
+
+    Args:
+        dtype: of the numbers.
+        names: loops in `LOOPS`; by default those of descent.
 
     Compiled code is kept beside this file or, where that is read-only, in the user's cache; the environment
     variable `NUMBA_CACHE_DIR` overrules both. Where nothing can be kept, every process compiles.
     """
     with _lock:
-        if dtype in _ready:
+        missing = [name for name in names or DESCENT if (dtype, name) not in _ready]
+        if not missing:
             return
         real = numba.from_dtype(layout.numpy_type(dtype))
         rows, row, sums, counts = real[:, ::1], real[::1], numba.float64[:, ::1], numba.int64[::1]
         signatures = {
             "descend_blocks": (rows, rows, row, row, row, rows, row, counts, sums),
             "sum_blocks": (rows, rows, row, row, row, counts, sums),
+            "solve_blocks": (rows, rows, row, rows, row, row, row, counts, sums, rows),
         }
         with event.install_listener("numba:compile", _Announcement()):
-            for name, signature in signatures.items():
-                _compile(name, signature)
-        _ready.add(dtype)
+            for name in missing:
+                _compile(LOOPS[name], name, signatures[name])
+                _ready.add((dtype, name))
 
 
-_lock, _ready = threading.Lock(), set[torch.dtype]()
+DESCENT = ("descend_blocks", "sum_blocks")
+LOOPS: dict[str, ModuleType] = {**dict.fromkeys(DESCENT, kernel), "solve_blocks": newton_step}
+"""What is compiled, by the module that holds it."""
+
+_lock, _ready = threading.Lock(), set[tuple[torch.dtype, str]]()
 
 
 class _Announcement(event.Listener):
@@ -56,10 +67,10 @@ class _Announcement(event.Listener):
         pass
 
 
-def _compile(name: str, signature: tuple[Any, ...]) -> None:
+def _compile(module: ModuleType, name: str, signature: tuple[Any, ...]) -> None:
     try:
-        getattr(kernel, name).compile(signature)
+        getattr(module, name).compile(signature)
     except Exception as error:  # whatever a damaged or full cache raises, the code itself is sound
         _log.warning("the cache of compiled code cannot be used (%s); compiling without it", error)
-        setattr(kernel, name, simd.not_kept(getattr(kernel, name)))
-        getattr(kernel, name).compile(signature)
+        setattr(module, name, simd.not_kept(getattr(module, name)))
+        getattr(module, name).compile(signature)

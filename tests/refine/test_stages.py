@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from dataclasses import astuple, replace
+from typing import Any
 
 import pytest
 from hypothesis import given
@@ -12,15 +13,24 @@ from hypothesis import strategies as st
 from nets.svbrdf import CHANNELS, MAPS
 from refine.light import LightFit
 from refine.parametrization import Parameters
-from refine.stages import LARGEST_SPEEDUP, RECIPES, GlobalStage, PixelStage, Rates, Recipe, find_recipe
+from refine.stages import (
+    LARGEST_SPEEDUP,
+    RECIPES,
+    GlobalStage,
+    PixelStage,
+    PosteriorStage,
+    Rates,
+    Recipe,
+    Stage,
+    Widths,
+    find_recipe,
+)
 from tests.helpers import random_svbrdf
 
 
 def recipe_of(*iterations: int) -> Recipe:
-    stages = (
-        GlobalStage(count) if index % 2 == 0 else PixelStage(count) for index, count in enumerate(iterations)
-    )
-    return Recipe("some", stages=tuple(stages))
+    kinds = (GlobalStage, PixelStage, PosteriorStage)
+    return Recipe("some", stages=tuple(kinds[index % 3](count) for index, count in enumerate(iterations)))
 
 
 @given(
@@ -33,6 +43,9 @@ def test_scaling_keeps_the_total_the_shares_and_everything_else(iterations: list
     for before, after in zip(recipe.stages, scaled.stages, strict=True):
         assert after.iterations >= 0
         assert abs(after.iterations - before.iterations * total / recipe.iterations) <= 1.0
+        if isinstance(before, PosteriorStage):
+            assert replace(after, iterations=before.iterations) == before
+            continue
         assert replace(after, iterations=before.iterations, rates=before.rates) == before
         pace = min(LARGEST_SPEEDUP, recipe.iterations / max(1, total))
         assert astuple(after.rates) == pytest.approx([rate * pace for rate in astuple(before.rates)])
@@ -55,17 +68,23 @@ def test_negative_iterations_are_refused(total: int) -> None:
         recipe_of(3).with_iterations(total)
 
 
+def rebuilt(stage: dict[str, Any]) -> Stage:
+    """Read a stage back from plain data."""
+    kind: Any = {kind().name: kind for kind in (GlobalStage, PixelStage, PosteriorStage)}[stage["stage"]]
+    parts = {"rates": Rates, "widths": Widths}
+    fields = {name: parts[name](**value) if name in parts else value for name, value in stage.items()}
+    del fields["stage"]
+    found: Stage = kind(**fields)
+    return found
+
+
 @pytest.mark.parametrize("recipe", [*RECIPES.values(), Recipe("bare", light_fit=None)], ids=lambda r: r.name)
 def test_a_recipe_is_json(recipe: Recipe) -> None:
     data = recipe.as_dict()
     assert json.loads(json.dumps(data, allow_nan=False)) == data
     assert data["name"] == recipe.name
     assert [stage["stage"] for stage in data["stages"]] == [stage.name for stage in recipe.stages]
-    kinds = {kind().name: kind for kind in (GlobalStage, PixelStage)}
-    rebuilt = [
-        kinds[stage["stage"]](stage["iterations"], Rates(**stage["rates"])) for stage in data["stages"]
-    ]
-    assert tuple(rebuilt) == recipe.stages
+    assert tuple(rebuilt(stage) for stage in data["stages"]) == recipe.stages
     assert data["light_fit"] == (None if recipe.light_fit is None else vars(recipe.light_fit))
     assert recipe.light_fit is None or LightFit(**data["light_fit"]) == recipe.light_fit
 
