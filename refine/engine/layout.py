@@ -76,9 +76,16 @@ def count_pixels(span: Span) -> Int[np.ndarray, "blocks"]:
     return np.minimum(kernel.BLOCK, span.stop - starts)
 
 
+def aligned_zeros(shape: tuple[int, ...], dtype: torch.dtype | np.dtype) -> Float[np.ndarray, "*shape"]:
+    """Return zeros that begin with a line of the cache, as torch's do: a vector across two costs more."""
+    name = str(dtype).removeprefix("torch.")
+    zeros: Float[np.ndarray, "*shape"] = torch.zeros(shape, dtype=getattr(torch, name)).numpy()
+    return zeros
+
+
 def scratch(real: np.dtype) -> Float[np.ndarray, "numbers"]:
     """Return what one thread needs besides the blocks it works on."""
-    return np.empty(kernel.SCRATCH_ROWS * kernel.BLOCK, dtype=real)
+    return aligned_zeros((kernel.SCRATCH_ROWS * kernel.BLOCK,), real)
 
 
 def given_geometry(geometry: Geometry) -> GeometryAt:
@@ -133,13 +140,10 @@ def pack_photos(
 ) -> Float[np.ndarray, "blocks numbers"]:
     """Pack photos with the geometry of their lights and cameras, side by side within each block."""
     pixels = torch.arange(span.start, span.stop)[None]
-    packed = np.concatenate(
-        [
-            _pack_photo(capture, geometry(pixels), span, dtype)
-            for capture, geometry in zip(captures, geometries, strict=True)
-        ],
-        axis=1,
-    )
+    packed = _blocks(len(captures) * kernel.PHOTO_ROWS, span, dtype)
+    for number, (capture, geometry) in enumerate(zip(captures, geometries, strict=True)):
+        first = number * kernel.PHOTO_ROWS
+        _pack_photo(packed[:, first : first + kernel.PHOTO_ROWS], capture, geometry(pixels), span)
     return packed.reshape(len(packed), -1)
 
 
@@ -158,9 +162,8 @@ def unpack(parameters: Float[np.ndarray, "blocks numbers"], span: Span, into: di
 
 
 def _pack_photo(
-    capture: Capture, geometry: Geometry, span: Span, dtype: torch.dtype
-) -> Float[np.ndarray, "blocks rows block"]:
-    blocks = _blocks(kernel.PHOTO_ROWS, span, dtype)
+    blocks: Float[np.ndarray, "blocks rows block"], capture: Capture, geometry: Geometry, span: Span
+) -> None:
     packed = slice(0, span.stop - span.start)
     _fill(blocks, kernel.LIGHT, geometry.light_direction, packed)
     _fill(blocks, kernel.VIEW, geometry.view, packed)
@@ -172,11 +175,10 @@ def _pack_photo(
     _fill(blocks, kernel.CEILING, capture.unsaturated, span)
     ceiling = blocks[:, kernel.CEILING]
     ceiling[:] = np.where(ceiling > 0.0, OUT_OF_REACH, 1.0)
-    return blocks
 
 
 def _blocks(rows: int, span: Span, dtype: torch.dtype) -> Float[np.ndarray, "blocks rows block"]:
-    return np.zeros((count_blocks(span), rows, kernel.BLOCK), dtype=numpy_type(dtype))
+    return aligned_zeros((count_blocks(span), rows, kernel.BLOCK), dtype)
 
 
 def _fill(blocks: Float[np.ndarray, "blocks rows block"], row: int, tensor: Tensor, span: Span) -> None:

@@ -14,7 +14,7 @@ from typing import Any, no_type_check
 
 import numba
 import numpy as np
-from llvmlite import ir
+from llvmlite import ir  # type: ignore[import-untyped]
 from numba import types
 from numba.extending import intrinsic, overload
 
@@ -38,10 +38,6 @@ _ZERO, _HALF_F, _ONE = (np.float32(x) for x in (0.0, 0.5, 1.0))
 _LARGEST_EXPONENT = 79.0
 _LARGEST_EXPONENT2, _ROUNDER = np.float32(_LARGEST_EXPONENT / math.log(2.0)), np.float32(1.5 * 2**23)
 _SHIFT, _BIAS = np.int32(23), np.int32(127)
-
-
-SOURCES = ("simd.py", "shading.py", "kernel.py", "normal_equations.py")
-"""Files whose functions others inline."""
 
 
 def compiled(function: Callable[..., Any]) -> Any:
