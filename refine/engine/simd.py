@@ -40,6 +40,10 @@ _LARGEST_EXPONENT2, _ROUNDER = np.float32(_LARGEST_EXPONENT / math.log(2.0)), np
 _SHIFT, _BIAS = np.int32(23), np.int32(127)
 
 
+SOURCES = ("simd.py", "shading.py", "kernel.py", "normal_equations.py")
+"""Files whose functions others inline."""
+
+
 def compiled(function: Callable[..., Any]) -> Any:
     """Compile when first called, to be inlined into what is kept."""
     return numba.njit(fastmath=_FAST, **_INLINE)(function)
