@@ -85,7 +85,7 @@ def development(
     _use_threads(threads)
     with _mistakes():
         require(data, DEVELOPMENT)
-        chosen = find_recipe("paper" if recipe == "none" else recipe)
+        chosen = find_recipe("default" if recipe == "none" else recipe)
         refiner = Refiner(init, chosen, resolution=size, flips=flips, seed=seed)
 
     about = provenance()  # of the code that runs, whatever is committed meanwhile
@@ -150,7 +150,7 @@ def real(
     inits = init or ["default"]
     with _mistakes():
         count = len(spread(len(list_real_scenes(folder)), scenes))
-        chosen = find_recipe("paper" if recipe == "none" else recipe)
+        chosen = find_recipe("default" if recipe == "none" else recipe)
         refiners = {
             name: Refiner(name, chosen, camera=CAMERA, resolution=size, flips=flips, seed=seed)
             for name in inits
@@ -177,7 +177,7 @@ def real(
 def light(
     data: Data,
     init: Checkpoints = None,
-    recipe: Annotated[str, typer.Option(help=f"Whose light fit: {', '.join(sorted(RECIPES))}.")] = "paper",
+    recipe: Annotated[str, typer.Option(help=f"Whose light fit: {', '.join(sorted(RECIPES))}.")] = "default",
     scenes: Scenes = None,
     size: Size = SIZE,
     seed: Annotated[int, typer.Option(min=0, help="Of the lights.")] = 0,
@@ -204,7 +204,7 @@ def light(
 def photos(
     folders: Annotated[list[Path], typer.Argument(help="Photos, or folders of them.")],
     init: Checkpoint = "default",
-    recipe: Annotated[str, typer.Option(help=f"One of {', '.join(sorted(RECIPES))}.")] = "paper",
+    recipe: Annotated[str, typer.Option(help=f"One of {', '.join(sorted(RECIPES))}.")] = "default",
     iters: Iterations = None,
     part: Annotated[
         str, typer.Option(help="K/N: only every N-th photo from the K-th, to share work.")

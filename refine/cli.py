@@ -78,7 +78,7 @@ def fit(
     ] = "auto",
     resolution: Annotated[int, _surface("PIXELS", "Longer side (256); 0 keeps the photo's")] = 256,
     init: Annotated[str, _refinement("NAME|FILE", "Network to start from (default)")] = "default",
-    recipe: Annotated[str, _refinement("NAME", "Stages of refinement (paper)")] = "paper",
+    recipe: Annotated[str, _refinement("NAME", "Stages of refinement (default), fast, paper")] = "default",
     iters: Annotated[int | None, _refinement("N", "Steps of all stages (the recipe's); 0 for none")] = None,
     quick: Annotated[
         bool,

@@ -27,7 +27,7 @@ from refine.stages import Recipe, find_recipe
 DEFAULT_RESOLUTION = 256
 """Longer side of the maps, pixels: what the network was trained on."""
 
-DEFAULT_RECIPE = "paper"
+DEFAULT_RECIPE = "default"
 
 
 @dataclass(frozen=True)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass, field, replace
+from itertools import pairwise
 from typing import Any
 
 import torch
@@ -141,18 +142,24 @@ class Recipe:
         """Return this recipe with its stages scaled so that they take `total` steps together.
 
         Rates are scaled the other way, up to `LARGEST_SPEEDUP`: fewer steps go as far with longer ones, and
-        more steps follow the same path more finely instead of drifting on.
+        more steps follow the same path more finely instead of drifting on. Posterior stages, which have
+        converged, keep their steps, but leave half of the total to the others.
         """
         if total < 0:
             raise ValueError(f"iterations must be 0 or more, got {total}")
-        ends = [0]
-        for stage in self.stages:
-            ends.append(ends[-1] + stage.iterations)
-        pace = min(LARGEST_SPEEDUP, ends[-1] / max(1, total))
-        marks = [round(end * total / max(1, ends[-1])) for end in ends]
+        solving = [isinstance(stage, PosteriorStage) for stage in self.stages]
+        counts = [stage.iterations for stage in self.stages]
+        solvers = sum(count for count, solves in zip(counts, solving, strict=True) if solves)
+        descents = self.iterations - solvers
+        kept = min(solvers, total // 2) if descents else total
+        pace = min(LARGEST_SPEEDUP, descents / max(1, total - kept))
+        shares = {
+            kind: _spread([c for c, solves in zip(counts, solving, strict=True) if solves is kind], whole)
+            for kind, whole in ((True, kept), (False, total - kept))
+        }
         stages = tuple(
-            stage.scaled(after - before, pace)
-            for stage, before, after in zip(self.stages, marks[:-1], marks[1:], strict=True)
+            stage.scaled(shares[solves].pop(0), pace)
+            for stage, solves in zip(self.stages, solving, strict=True)
         )
         return replace(self, stages=stages)
 
@@ -186,3 +193,12 @@ def find_recipe(name: str) -> Recipe:
     if name not in RECIPES:
         raise ValueError(f"no recipe is called {name!r}; the known ones are {', '.join(sorted(RECIPES))}")
     return RECIPES[name]
+
+
+def _spread(counts: list[int], total: int) -> list[int]:
+    """Return counts in the same proportions that add up to a total."""
+    ends = [0]
+    for count in counts:
+        ends.append(ends[-1] + count)
+    marks = [round(end * total / max(1, ends[-1])) for end in ends]
+    return [after - before for before, after in pairwise(marks)]

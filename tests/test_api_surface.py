@@ -105,7 +105,7 @@ def test_defaults_that_results_depend_on() -> None:
         name: parameter.default for name, parameter in inspect.signature(refine.Refiner).parameters.items()
     }
     assert defaults["model"] == "default"
-    assert defaults["recipe"] == "paper"
+    assert defaults["recipe"] == "default"
     assert (defaults["resolution"], defaults["seed"], defaults["device"]) == (256, 0, "cpu")
     assert inspect.signature(importlib.import_module("nets.checkpoint").load_model).parameters[
         "name"

@@ -194,7 +194,9 @@ def test_an_unknown_recipe_is_refused() -> None:
 
 def test_progress_and_losses_tell_of_every_iteration() -> None:
     told: list[tuple[str, int, int, float]] = []
-    refined = Refiner(wrong).fit(picture(), light=FLASH, iters=10, progress=lambda *news: told.append(news))
+    refined = Refiner(wrong, "paper").fit(
+        picture(), light=FLASH, iters=10, progress=lambda *news: told.append(news)
+    )
     assert [iteration for _, iteration, _, _ in told] == list(range(1, 11))
     assert {total for _, _, total, _ in told} == {10}
     stages = RECIPES["paper"].with_iterations(10).stages
@@ -328,7 +330,7 @@ def test_the_result_holds_no_graph_and_the_input_is_untouched() -> None:
 
 
 def test_stages_start_where_the_last_one_ended() -> None:
-    refined = Refiner(wrong).fit(flash_photo(24, 24), light=FLASH, iters=20)
+    refined = Refiner(wrong, "paper").fit(flash_photo(24, 24), light=FLASH, iters=20)
     seconds: dict[str, float] = {}
     again, losses = run_stages(refined.svbrdf, refined.capture, refined.recipe, seconds)
     assert losses["initialization"][0] == pytest.approx(min(refined.losses["per-pixel"]), rel=1e-3)
