@@ -13,43 +13,34 @@ from numba.core import event
 
 from refine.engine import kernel, layout, newton_step, simd
 
-COMPILING = "compiling the refinement for this processor; this happens once and takes some ten seconds"
+COMPILING = "compiling the refinement for this processor; this happens once and takes some twenty seconds"
 
 _log = logging.getLogger(__name__)
 
 
-def prepare(dtype: torch.dtype = torch.float32, *names: str) -> None:
+def prepare(dtype: torch.dtype = torch.float32) -> None:
     """Compile for float32 or float64, or load what was compiled before; the log says if it has to compile.
-
-    Args:
-        dtype: of the numbers.
-        names: loops in `LOOPS`; by default those of descent.
 
     Compiled code is kept beside this file or, where that is read-only, in the user's cache; the environment
     variable `NUMBA_CACHE_DIR` overrules both. Where nothing can be kept, every process compiles.
     """
     with _lock:
-        missing = [name for name in names or DESCENT if (dtype, name) not in _ready]
-        if not missing:
+        if dtype in _ready:
             return
         real = numba.from_dtype(layout.numpy_type(dtype))
         rows, row, sums, counts = real[:, ::1], real[::1], numba.float64[:, ::1], numba.int64[::1]
-        signatures = {
-            "descend_blocks": (rows, rows, row, row, row, rows, row, counts, sums),
-            "sum_blocks": (rows, rows, row, row, row, counts, sums),
-            "solve_blocks": (rows, rows, row, rows, row, row, row, counts, sums, rows),
-        }
+        loops: list[tuple[ModuleType, str, tuple[Any, ...]]] = [
+            (kernel, "descend_blocks", (rows, rows, row, row, row, rows, row, counts, sums)),
+            (kernel, "sum_blocks", (rows, rows, row, row, row, counts, sums)),
+            (newton_step, "solve_blocks", (rows, rows, row, rows, row, row, row, counts, sums, rows)),
+        ]
         with event.install_listener("numba:compile", _Announcement()):
-            for name in missing:
-                _compile(LOOPS[name], name, signatures[name])
-                _ready.add((dtype, name))
+            for module, name, signature in loops:
+                _compile(module, name, signature)
+        _ready.add(dtype)
 
 
-DESCENT = ("descend_blocks", "sum_blocks")
-LOOPS: dict[str, ModuleType] = {**dict.fromkeys(DESCENT, kernel), "solve_blocks": newton_step}
-"""What is compiled, by the module that holds it."""
-
-_lock, _ready = threading.Lock(), set[tuple[torch.dtype, str]]()
+_lock, _ready = threading.Lock(), set[torch.dtype]()
 
 
 class _Announcement(event.Listener):

@@ -12,7 +12,6 @@ from nets.render import PAPER, Conventions, Geometry
 from nets.svbrdf import MAPS
 from refine.capture import Capture
 from refine.engine import kernel, layout, newton_step, normal_equations
-from refine.engine.compilation import prepare
 from refine.engine.fused import Packed, fused_problem
 from refine.engine.gauss_newton import ACCEPTED, DAMPING_RANGE, FIRST_DAMPING, REJECTED, Posterior
 from refine.engine.reference import Progress
@@ -41,7 +40,6 @@ def solve(
     """
     problem = fused_problem(start, capture, geometry, conventions)
     real = problem.real
-    prepare(start.normal.dtype, "solve_blocks")
     prior = _prior(widths).astype(real)
     robust = np.array([noise, huber], dtype=real)
     pace = np.array([ACCEPTED, REJECTED, *DAMPING_RANGE, FIRST_DAMPING], dtype=real)

@@ -64,7 +64,6 @@ def cli(checkpoint: Path) -> Callable[..., int]:
 def result(tmp_path_factory: pytest.TempPathFactory, photo: Path, checkpoint: Path) -> tuple[Path, str, str]:
     """Run once as a person would; return the current folder, standard output and standard error."""
     prepare()  # compile once, here: a first run would announce it
-    prepare(torch.float32, "solve_blocks")
     cwd = tmp_path_factory.mktemp("cwd")
     done = script(photo, "--init", checkpoint, "--iters", "6", *FAST, "--json", cwd=cwd)
     assert done.returncode == 0, done.stderr
