@@ -305,7 +305,7 @@ def kept_anew(source: str | Path) -> object:
 def compile_small(caplog: pytest.LogCaptureFixture) -> list[str]:
     caplog.clear()
     with numba.core.event.install_listener("numba:compile", compilation._Announcement()):
-        compilation._compile("small", (numba.float64,))
+        compilation._compile(kernel, "small", (numba.float64,))
     assert kernel.small(1.0) == 2.0  # type: ignore[attr-defined]
     return [record.message for record in caplog.records if record.levelno >= logging.WARNING]
 
