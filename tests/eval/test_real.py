@@ -148,7 +148,7 @@ class Spy(Refiner):
 
 
 def test_refinement_is_given_photo_and_light(scene: RealScene) -> None:
-    refiner = Spy(FakeModel(), camera=CAMERA, resolution=SIZE)
+    refiner = Spy(FakeModel(), "paper", camera=CAMERA, resolution=SIZE)
     found = real_estimator({"grey": refiner}, 60)(scene)
     assert list(found) == ["grey, initialization", "grey, paper, 60 iterations"]
     assert not torch.equal(*(estimate.svbrdf.diffuse for estimate in found.values()))
@@ -166,7 +166,7 @@ def test_refinement_under_a_light_as_bright_as_needed_leaves_brightness_alone(
         whole = surface.map(lambda tensor: torch.nn.functional.interpolate(tensor, size=photo.shape[-2:]))
         return whole, PointLight.at((0.0, 0.0, 2.0))
 
-    refiner = Spy(brighter, camera=CAMERA, resolution=SIZE)
+    refiner = Spy(brighter, "paper", camera=CAMERA, resolution=SIZE)
     first, refined = real_estimator({"true": refiner}, 40, match_exposure=True)(scene).values()
     assert refiner.given[1].intensity[0, 0] == pytest.approx(exposure(first.svbrdf, scene))
     darkened = real_estimator({"true": refiner}, 40)(scene)["true, paper, 40 iterations"]
