@@ -1,4 +1,7 @@
-"""From a photo of any size to a starting material: the network sees a square, nothing is cropped away."""
+"""From a photo of any size to a starting material: the network sees a square, nothing is cropped away.
+
+How the network's maps come to the pixels of a larger photo is the business of `upsampling.py`.
+"""
 
 from __future__ import annotations
 
@@ -10,8 +13,9 @@ from torch import Tensor
 from torch.nn import functional
 
 from nets.ensemble import Predictor
-from nets.render import PointLight
-from nets.svbrdf import MAPS, SVBRDF
+from nets.render import Camera, PointLight
+from nets.svbrdf import SVBRDF
+from refine.upsampling import Box, legal, upsample
 
 NETWORK_SIZE = 256
 """Side of the square the network sees, pixels (paper Sec. 5.1)."""
@@ -20,7 +24,12 @@ Predict = Callable[[Float[Tensor, "1 3 256 256"]], tuple[SVBRDF, PointLight]]
 """Linear square photo to material and light: all that refinement asks of a model."""
 
 
-def initialize(model: Predict | Predictor, photo: Float[Tensor, "1 3 h w"]) -> tuple[SVBRDF, PointLight]:
+def initialize(
+    model: Predict | Predictor,
+    photo: Float[Tensor, "1 3 h w"],
+    light: PointLight | None = None,
+    camera: Camera | None = None,
+) -> tuple[SVBRDF, PointLight]:
     """Let the model guess the material of a whole photo.
 
     A photo that is not square is continued by mirroring, not squashed or cropped: the longer side spans
@@ -29,6 +38,8 @@ def initialize(model: Predict | Predictor, photo: Float[Tensor, "1 3 h w"]) -> t
     Args:
         model: `predict`, or an object that has it.
         photo: linear radiance of any size.
+        light: of the photo, if known; only large photos need it, to tell slopes from paint.
+        camera: of the photo, likewise; as in `nets.render.render`.
 
     Returns:
         A legal material at the photo's size, and the model's light.
@@ -40,23 +51,17 @@ def initialize(model: Predict | Predictor, photo: Float[Tensor, "1 3 h w"]) -> t
     height, width = photo.shape[-2:]
     longer = max(height, width)
     top, left = (longer - height) // 2, (longer - width) // 2
-    square = _mirror_pad(photo, top, longer - height - top, left, longer - width - left)
     with torch.no_grad():
-        svbrdf, light = _checked(predict(_resize(square, NETWORK_SIZE)))
-    whole = svbrdf.detach().map(lambda tensor: _resize(tensor, longer))
-    window = (..., slice(top, top + height), slice(left, left + width))
-    return legal(whole.map(lambda tensor: tensor[window].contiguous())).validate(), light
-
-
-def legal(svbrdf: SVBRDF) -> SVBRDF:
-    """Return the nearest legal material: normals unit length, values in range (after resampling)."""
-    normal, diffuse, roughness, specular = (getattr(svbrdf, name) for name in MAPS)
-    return SVBRDF(
-        functional.normalize(normal, dim=1),
-        diffuse.clamp(0.0, 1.0),
-        roughness.clamp(1e-3, 1.0),
-        specular.clamp(0.0, 1.0),
-    )
+        seen = _square(photo, top, left)
+        svbrdf, guess = _checked(predict(seen))
+        svbrdf = svbrdf.detach()
+        if longer > NETWORK_SIZE:
+            place = Box(top / longer, left / longer, height / longer, width / longer)
+            whole = upsample(svbrdf, seen, photo, place, light or guess, camera)
+        else:
+            window = (..., slice(top, top + height), slice(left, left + width))
+            whole = legal(svbrdf.map(lambda tensor: _resize(tensor, (longer, longer))[window].contiguous()))
+    return whole.validate(), guess
 
 
 def _checked(answer: object) -> tuple[SVBRDF, PointLight]:
@@ -79,19 +84,23 @@ def _checked(answer: object) -> tuple[SVBRDF, PointLight]:
     return svbrdf, light
 
 
-def _resize(tensor: Tensor, side: int) -> Tensor:
-    if tensor.shape[-1] == side:
+def _square(photo: Float[Tensor, "1 3 h w"], top: int, left: int) -> Float[Tensor, "1 3 256 256"]:
+    """Continue a photo by mirroring to a square and resize that; its longer side first, to hold little."""
+    height, width = photo.shape[-2:]
+    if width >= height:
+        narrow = _resize(photo, (height, NETWORK_SIZE))
+        square = narrow[..., _mirrored(height, top, width - height - top), :]
+    else:
+        narrow = _resize(photo, (NETWORK_SIZE, width))
+        square = narrow[..., _mirrored(width, left, height - width - left)]
+    return _resize(square, (NETWORK_SIZE, NETWORK_SIZE))
+
+
+def _resize(tensor: Tensor, size: tuple[int, int]) -> Tensor:
+    if tuple(tensor.shape[-2:]) == size:
         return tensor
-    smaller = side < tensor.shape[-1]
-    return functional.interpolate(
-        tensor, size=(side, side), mode="bilinear", align_corners=False, antialias=smaller
-    )
-
-
-def _mirror_pad(photo: Tensor, top: int, bottom: int, left: int, right: int) -> Tensor:
-    rows = _mirrored(photo.shape[-2], top, bottom)
-    columns = _mirrored(photo.shape[-1], left, right)
-    return photo[..., rows, :][..., columns]
+    smaller = size[0] < tensor.shape[-2] or size[1] < tensor.shape[-1]
+    return functional.interpolate(tensor, size=size, mode="bilinear", align_corners=False, antialias=smaller)
 
 
 def _mirrored(count: int, before: int, after: int) -> Tensor:
