@@ -84,7 +84,7 @@ def fit(
         bool,
         _switch("--quick", help=f"--iters {QUICK_ITERATIONS} --no-report", panel="Refinement"),
     ] = False,
-    engine: Annotated[str, _refinement("NAME", "(auto), fused, reference")] = "auto",
+    engine: Annotated[str, _refinement("NAME", "(auto), fused, compiled, reference")] = "auto",
     seed: Annotated[int, _refinement("N", "Same seed, same bytes (0)")] = 0,
     out: Annotated[Path | None, _output("DIR", "Folder (./<photo>_material)")] = None,
     format: Annotated[str, _output("NAME", "(png), png8, tif, tif8, tif32, exr, exr32")] = "png",
@@ -125,7 +125,7 @@ def fit(
     import torch
 
     from nets.render import Camera, PointLight
-    from refine.engine import ENGINES
+    from refine.engine import ENGINES, obstacle
     from refine.light import FalloffChoice
     from refine.photo import ColorSpaceChoice, read_photo
     from refine.refiner import Refiner
@@ -137,8 +137,8 @@ def fit(
     _choose("--format", format, tuple(MAP_FORMATS))
     _choose("--engine", engine, ("auto", *ENGINES))
     _require_device(device)
-    if engine == "fused" and torch.device(device).type != "cpu":
-        raise UserError(f"--engine fused runs on CPUs, not on {device}; leave --engine or --device out.")
+    if engine != "auto" and (reason := obstacle(engine, torch.device(device).type)) is not None:
+        raise UserError(f"--engine {engine} cannot be used: {reason}; leave --engine or --device out.")
     if threads is not None:
         torch.set_num_threads(threads)
     read = read_photo(photo, color_space=cast(ColorSpaceChoice, color_space))

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 
 import torch
-from jaxtyping import Bool
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from losses.refinement import photo_distance
@@ -56,32 +57,11 @@ def descend(
     Returns:
         The parameters with the lowest loss seen, and the loss before every step and after the last.
     """
-    captures, geometries = several(capture, geometry, conventions)
+    objective = Objective.of(start, offsets, capture, geometry, conventions)
     moving = {name: offset.detach().clone().requires_grad_(True) for name, offset in offsets.items()}
-    # The gradient of a pixel's own distance, or its average over all pixels where they share one offset.
-    own_pixels = max(offset.shape[-2] * offset.shape[-1] for offset in offsets.values())
     groups = [{"params": [tensor], "lr": rates[name]} for name, tensor in moving.items()]
     optimizer = torch.optim.Adam(groups, betas=ADAM_BETAS, eps=ADAM_EPSILON)
-    schedule = torch.optim.lr_scheduler.LambdaLR(
-        optimizer,
-        lambda step: FINAL_RATE + (1.0 - FINAL_RATE) * math.cos(math.pi / 2 * step / max(1, iterations)),
-    )
-
-    # A clipped pixel cannot say which of its maps is wrong: of itself it keeps what it had. It still counts
-    # where all pixels move together. Of several photos it takes one in which it is not clipped.
-    own = {name: offset.shape[-2:] == start.normal.shape[-2:] for name, offset in offsets.items()}
-    moves = unsaturated_somewhere(captures)
-
-    def moved(values: dict[str, Tensor]) -> Parameters:
-        return start.shifted({name: value * moves if own[name] else value for name, value in values.items()})
-
-    def distance() -> Tensor:
-        material = moved(moving).svbrdf()
-        distances = [
-            photo_distance(shade(material, geometry, conventions), capture.photo, capture.unsaturated)
-            for capture, geometry in zip(captures, geometries, strict=True)
-        ]
-        return torch.stack(distances).sum()
+    schedule = torch.optim.lr_scheduler.LambdaLR(optimizer, lambda step: share_of_rate(step, iterations))
 
     history: list[float] = []
     best, best_loss = {name: value.detach().clone() for name, value in moving.items()}, float("inf")
@@ -95,16 +75,77 @@ def descend(
 
     for iteration in range(iterations):
         optimizer.zero_grad(set_to_none=True)
-        loss = distance()
+        loss = objective.distance(moving)
         keep(float(loss.detach()))
-        (loss * own_pixels).backward()
+        (loss * objective.own_pixels).backward()
         optimizer.step()
         schedule.step()
         if progress is not None:
             progress(iteration + 1, history[-1])
     with torch.no_grad():
-        keep(float(distance()))
-    return moved(best), history
+        keep(float(objective.distance(moving)))
+    return objective.moved(best), history
+
+
+def share_of_rate(step: int, iterations: int) -> float:
+    """Return which share of the learning rates is left before a step, counted from 0."""
+    return FINAL_RATE + (1.0 - FINAL_RATE) * math.cos(math.pi / 2 * step / max(1, iterations))
+
+
+@dataclass(frozen=True)
+class Objective:
+    """The photos' distance from their renderings as a function of offsets.
+
+    Attributes:
+        start: where every pixel begins.
+        own: names of the maps whose offsets are each pixel's own.
+        captures: the photos.
+        geometries: of their lights and cameras.
+        conventions: of the renderer.
+        moves: where a pixel's own offsets count. A clipped pixel cannot say which of its maps is wrong: of
+            itself it keeps what it had. It still counts where all pixels move together. Of several photos it
+            takes one in which it is not clipped.
+        own_pixels: factor of the distance whose gradient is that of a pixel's own distance, or the average
+            of these over all pixels where they share one offset.
+    """
+
+    start: Parameters
+    own: tuple[str, ...]
+    captures: list[Capture]
+    geometries: list[Geometry]
+    conventions: Conventions
+    moves: Bool[Tensor, "1 1 h w"]
+    own_pixels: int
+
+    @staticmethod
+    def of(
+        start: Parameters,
+        offsets: dict[str, Tensor],
+        capture: Capture | Sequence[Capture],
+        geometry: Geometry | Sequence[Geometry] | None,
+        conventions: Conventions,
+    ) -> Objective:
+        """Take the arguments of `descend`."""
+        captures, geometries = several(capture, geometry, conventions)
+        own = tuple(name for name, offset in offsets.items() if offset.shape[-2:] == start.normal.shape[-2:])
+        own_pixels = max(offset.shape[-2] * offset.shape[-1] for offset in offsets.values())
+        moves = unsaturated_somewhere(captures)
+        return Objective(start, own, captures, geometries, conventions, moves, own_pixels)
+
+    def moved(self, offsets: dict[str, Tensor]) -> Parameters:
+        """Return the parameters there."""
+        return self.start.shifted(
+            {name: value * self.moves if name in self.own else value for name, value in offsets.items()}
+        )
+
+    def distance(self, offsets: dict[str, Tensor]) -> Float[Tensor, ""]:
+        """Return the sum of the photos' distances there."""
+        material = self.moved(offsets).svbrdf()
+        distances = [
+            photo_distance(shade(material, geometry, self.conventions), capture.photo, capture.unsaturated)
+            for capture, geometry in zip(self.captures, self.geometries, strict=True)
+        ]
+        return torch.stack(distances).sum()
 
 
 def several(
