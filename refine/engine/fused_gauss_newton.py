@@ -12,7 +12,7 @@ from nets.render import PAPER, Conventions, Geometry
 from nets.svbrdf import MAPS
 from refine.capture import Capture
 from refine.engine import kernel, layout, newton_step, normal_equations
-from refine.engine.fused import Packed, fused_problem
+from refine.engine.fused import fused_problem
 from refine.engine.gauss_newton import ACCEPTED, DAMPING_RANGE, FIRST_DAMPING, REJECTED, Posterior
 from refine.engine.reference import Progress
 from refine.engine.workers import Workers
@@ -47,29 +47,27 @@ def solve(
     total, told = np.zeros((2, iterations + 1)), 0
     with Workers.of_torch() as workers:
         for span in problem.spans():
-            packed = problem.pack({}, span)
-            costs = np.empty((len(packed.counts), total.size))
-            spread = np.empty((len(packed.counts), kernel.PARAMETERS * kernel.BLOCK), dtype=real)
+            costs = np.empty((layout.count_blocks(span), total.size))
 
-            def work(
-                part: slice, packed: Packed = packed, costs: np.ndarray = costs, spread: np.ndarray = spread
-            ) -> None:
+            def work(part: slice, span: slice = span, costs: np.ndarray = costs) -> None:
+                packed = problem.pack({}, layout.pixels_of(part, span))
+                spread = np.empty((len(packed.counts), kernel.PARAMETERS * kernel.BLOCK), dtype=real)
                 newton_step.solve_blocks(
-                    packed.surface[part],
-                    packed.photos[part],
+                    packed.surface,
+                    packed.photos,
                     problem.constants,
                     prior,
                     robust,
                     pace,
                     np.empty(normal_equations.NEWTON_ROWS * kernel.BLOCK, dtype=real),
-                    packed.counts[part],
+                    packed.counts,
                     costs[part],
-                    spread[part],
+                    spread,
                 )
+                layout.unpack_offsets(packed.surface, packed.pixels, found)
+                layout.unpack(spread, packed.pixels, deviations)
 
-            workers.run(work, len(packed.counts))
-            layout.unpack_offsets(packed.surface, span, found)
-            layout.unpack(spread, span, deviations)
+            workers.run(work, len(costs))
             total += costs.sum(axis=0).reshape(total.shape)
             mark = iterations * span.stop // problem.pixels
             if progress is not None:
