@@ -138,8 +138,9 @@ def find_shares(svbrdf: SVBRDF, light: PointLight, camera: Camera | None = None)
 def legal(svbrdf: SVBRDF) -> SVBRDF:
     """Return the nearest legal material: normals unit length, values in range (after resampling)."""
     normal, diffuse, roughness, specular = (getattr(svbrdf, name) for name in MAPS)
+    squared = (normal**2).sum(dim=1, keepdim=True).clamp(min=torch.finfo(normal.dtype).tiny)
     return SVBRDF(
-        functional.normalize(normal, dim=1),
+        normal * torch.rsqrt(squared),
         diffuse.clamp(0.0, 1.0),
         roughness.clamp(1e-3, 1.0),
         specular.clamp(0.0, 1.0),
@@ -155,12 +156,15 @@ def sample(
     image: Float[Tensor, "1 c h w"], rows: Float[Tensor, "height"], columns: Float[Tensor, "width"]
 ) -> Float[Tensor, "1 c height width"]:
     """Interpolate bilinearly where fractional rows and columns cross; pixel centres are whole numbers."""
-    for axis, places in ((-2, rows), (-1, columns)):
+    rows = rows.clamp(0.0, float(image.shape[-2] - 1))
+    top = int(rows.min())
+    # Columns first, of the rows that are needed: there are fewer of them than there will be.
+    image = image[..., top : int(rows.max()) + 2, :]
+    for axis, places in ((-1, columns), (-2, rows - top)):
         last = image.shape[axis] - 1
         places = places.clamp(0.0, float(last))
-        before = places.floor()
-        weight = (places - before).to(image.dtype)
-        index = before.long()
+        index = places.long()
+        weight = (places - index).to(image.dtype)
         low = image.index_select(axis, index)
         high = image.index_select(axis, (index + 1).clamp(max=last))
         image = torch.lerp(low, high, weight[:, None] if axis == -2 else weight)
