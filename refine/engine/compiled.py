@@ -28,6 +28,10 @@ COMPILING = "compiling the refinement with torch.compile; the first time this ta
 BURST = 20
 """Iterations between two looks at the losses, each of which waits until the device has caught up."""
 
+MOST_GRAPHS = 64
+"""Graphs that a process may make: one for each set of moving maps, number of photos, number of threads and so
+on, at its first size and for all others. Torch's own limit of 8 is soon reached, and then an error."""
+
 Offsets = dict[str, Tensor]
 
 _log = logging.getLogger(__name__)
@@ -66,7 +70,8 @@ def descend(
     losses: list[Tensor] = []
     # The last evaluation is that after the last step; the step that it ends with does not matter.
     for iteration in range(iterations + 1):
-        state, loss = step(objective, state, paces[iteration])
+        with torch._dynamo.config.patch(cache_size_limit=MOST_GRAPHS):
+            state, loss = step(objective, state, paces[iteration])
         losses.append(loss)
         if len(losses) == BURST or iteration == iterations:
             burst = torch.stack(losses).tolist()
