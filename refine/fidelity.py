@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import math
+
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from nets.color import gamma_encode
+from refine.bands import bands
 from refine.capture import Capture
 
 
@@ -23,8 +26,10 @@ def rerendering_rmse(rendering: Float[Tensor, "1 3 h w"], capture: Capture) -> f
     Returns:
         The error in [0, 1], or None if every pixel of the photo is saturated.
     """
-    difference = (gamma_encode(rendering) - gamma_encode(capture.photo)).double()
-    counted = capture.unsaturated.expand_as(difference)
-    if not bool(counted.any()):
-        return None
-    return float(difference[counted].square().mean().sqrt())
+    square, count = 0.0, 0
+    for rows in bands(*rendering.shape[-2:]):
+        seen, shown = (gamma_encode(image[..., rows, :]) for image in (capture.photo, rendering))
+        counted = capture.unsaturated[..., rows, :]
+        difference = torch.where(counted, shown - seen, 0.0).double()
+        square, count = square + float(difference.square().sum()), count + int(counted.sum())
+    return math.sqrt(square / (3 * count)) if count else None

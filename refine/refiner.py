@@ -13,8 +13,9 @@ from torch import Tensor
 
 from nets.checkpoint import load_model
 from nets.ensemble import FlipAverage
-from nets.render import Camera, PointLight, render
+from nets.render import Camera, PointLight
 from nets.svbrdf import SVBRDF
+from refine.bands import render_in_bands
 from refine.capture import Capture
 from refine.engine import choose_engine
 from refine.initialization import Predict, Predictor, initialize
@@ -62,10 +63,9 @@ class Refined:
     settings: dict[str, Any] = field(default_factory=dict)
     engine: str = "reference"
 
-    @torch.no_grad()
     def render(self, light: PointLight | None = None, camera: Camera | None = None) -> Tensor:
         """Render the refined maps, linear `[1, 3, H, W]`; defaults to the photo's light and camera."""
-        return render(self.svbrdf, light or self.light, camera or self.camera)
+        return render_in_bands(self.svbrdf, light or self.light, camera or self.camera)
 
     def save(
         self,
@@ -176,7 +176,7 @@ class Refiner:
         seconds: dict[str, float] = {}
 
         clock = time.perf_counter()
-        initial, guess = initialize(self.model, capture.photo)
+        initial, guess = initialize(self.model, capture.photo, light, self.camera)
         if falloff is not None and falloff != "auto":
             guess = replace(guess, falloff=falloff)
         seconds["initialization"] = time.perf_counter() - clock

@@ -20,8 +20,8 @@ import numpy as np
 import torch
 
 from nets.checkpoint import read_record, resolve
-from nets.render import render
 from refine import __version__
+from refine.bands import render_in_bands
 from refine.errors import UserError
 from refine.fidelity import rerendering_rmse
 from refine.files import write_together
@@ -147,7 +147,9 @@ def describe(
     Returns:
         The record. It depends on the photo and the settings alone but for the key `SECONDS`.
     """
-    before = rerendering_rmse(render(refined.initial, refined.light, refined.camera), refined.capture)
+    before = rerendering_rmse(
+        render_in_bands(refined.initial, refined.light, refined.camera), refined.capture
+    )
     after = rerendering_rmse(refined.render(), refined.capture)
     height, width = refined.svbrdf.size
     position, intensity = (

@@ -20,8 +20,9 @@ from torch import Tensor
 from torch.nn.functional import interpolate
 
 from nets.color import gamma_encode, linear_to_srgb
-from nets.render import PointLight, render
+from nets.render import PointLight
 from nets.svbrdf import MAPS, SVBRDF
+from refine.bands import render_in_bands
 from refine.fidelity import rerendering_rmse
 from refine.refiner import Refined
 
@@ -56,9 +57,8 @@ def draw_sheet(refined: Refined) -> Figure:
     height, width = refined.svbrdf.size
     sheet = _Sheet(height, width)
     photo = refined.capture.photo
-    with torch.no_grad():
-        before = render(refined.initial, refined.light, refined.camera)
-        after = refined.render()
+    before = render_in_bands(refined.initial, refined.light, refined.camera)
+    after = refined.render()
     renderings = (("initialization, re-rendered", before), ("refined, re-rendered", after))
 
     sheet.title(Path(refined.source).name, _subtitle(refined))
