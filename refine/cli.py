@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
 USER_ERROR, INTERRUPTED = 2, 130
 
-SUBCOMMANDS: dict[str, str] = {}
+SUBCOMMANDS: dict[str, str] = {"export": "refine.export.cli:app"}
 """Commands besides the default one, as `name: "module:typer_app"`; imported only when asked for."""
 
 QUICK_ITERATIONS = 50

@@ -125,7 +125,7 @@ def write_maps(
     paths = map_paths(folder, stem, rendering=rendering is not None, format=format)
     with write_together(list(paths.values())) as temporaries:
         for (name, path), temporary in zip(paths.items(), temporaries, strict=True):
-            _write_image(
+            write_image(
                 temporary, path, _encode(name, tensors[name], format), _color_space(name, format), format
             )
     return paths
@@ -210,7 +210,7 @@ def _color_space(name: str, format: MapFormat) -> str:
     return "lin_rec709_scene" if format.linear else "srgb_rec709_scene"
 
 
-def _write_image(
+def write_image(
     temporary: Path,
     path: Path,
     pixels: Float32[np.ndarray, "h w channels"],
@@ -219,12 +219,19 @@ def _write_image(
 ) -> None:
     """Write one image to `temporary`, and decode it again, since not every encoder notices a full disk.
 
+    Args:
+        temporary: of `write_together`.
+        path: what it will be called.
+        pixels: 1, 3 or 4 channels, as they are to be stored, 1 being an integer format's maximum.
+        color_space: a colour interop identifier, or "data".
+        format: of the file.
+
     Raises:
         UserError: it could not be written; the message names `path`.
     """
     height, width, channels = pixels.shape
     spec = oiio.ImageSpec(width, height, channels, _STORAGE[format.extension, format.bits])
-    spec.channelnames = ("Y",) if channels == 1 else ("R", "G", "B")
+    spec.channelnames = ("Y",) if channels == 1 else ("R", "G", "B", "A")[:channels]
     spec.attribute("oiio:ColorSpace", color_space)
     spec.attribute("DateTime", "")  # the time of writing would make every file differ
     spec.attribute("compression", "zip")

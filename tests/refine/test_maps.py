@@ -150,7 +150,7 @@ def test_same_material_same_bytes(tmp_path: Path, format: MapFormat) -> None:
 
 
 def test_a_failure_leaves_nothing_behind(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    write = maps._write_image
+    write = maps.write_image
 
     def fail_on_roughness(temporary: Path, path: Path, *rest: object) -> None:
         if "roughness" in path.name:
@@ -160,7 +160,7 @@ def test_a_failure_leaves_nothing_behind(tmp_path: Path, monkeypatch: pytest.Mon
     material = some_material()
     before = write_maps(tmp_path, "old", material)
     contents = {path.name: path.read_bytes() for path in before.values()}
-    monkeypatch.setattr(maps, "_write_image", fail_on_roughness)
+    monkeypatch.setattr(maps, "write_image", fail_on_roughness)
     with pytest.raises(UserError, match="roughness"):
         write_maps(tmp_path / "new", "stone", material)
     darker = SVBRDF(material.normal, material.diffuse * 0.5, material.roughness, material.specular)
