@@ -21,6 +21,7 @@ import typer
 from refine import __version__
 from refine.console import progress_bar, summarise
 from refine.errors import UserError
+from refine.export.targets import parse_targets
 
 if TYPE_CHECKING:
     from nets.render import PointLight
@@ -90,6 +91,9 @@ def fit(
     format: Annotated[str, _output("NAME", "(png), png8, tif, tif8, tif32, exr, exr32")] = "png",
     normals: Annotated[str, _output("NAME", "(opengl): green is up, directx: down")] = "opengl",
     no_report: Annotated[bool, _switch("--no-report", help="No <photo>_report.png", panel="Output")] = False,
+    export: Annotated[
+        str | None, _output("NAME,NAME", "For other programs, too: see refine export --help")
+    ] = None,
     as_json: Annotated[bool, _switch("--json", help="Print the JSON record, too", panel="Output")] = False,
     quiet: Annotated[bool, _switch("--quiet", "-q", help="Print nothing but errors")] = False,
     device: Annotated[str, _option("NAME", "(cpu), cuda, cuda:1, mps", None)] = "cpu",
@@ -121,11 +125,13 @@ def fit(
     if quick:
         iters = QUICK_ITERATIONS if iters is None else iters
         no_report = True
+    targets = parse_targets("--export", export) if export is not None else []
 
     import torch
 
     from nets.render import Camera, PointLight
     from refine.engine import ENGINES, obstacle
+    from refine.export.cli import export_folder
     from refine.light import FalloffChoice
     from refine.photo import ColorSpaceChoice, read_photo
     from refine.refiner import Refiner
@@ -196,6 +202,8 @@ def fit(
         print()
     if not quiet:
         summarise(record, paths, estimated=position is None)
+    if targets:
+        export_folder(output.folder, targets, name=output.stem, quiet=quiet)
 
 
 def parse_point(option: str, text: str, otherwise: str) -> tuple[float, float, float]:
@@ -285,7 +293,7 @@ def run(arguments: Sequence[str]) -> int:
     except (KeyboardInterrupt, typer.Abort):
         code = INTERRUPTED
     except Exception as error:
-        if (sentence := _sentence(error)) is None:
+        if (sentence := _sentence(error, name)) is None:
             raise
         print(f"refine: {sentence}", file=sys.stderr)
         return USER_ERROR
@@ -294,14 +302,14 @@ def run(arguments: Sequence[str]) -> int:
     return int(code)
 
 
-def _sentence(error: Exception) -> str | None:
+def _sentence(error: Exception, command: str) -> str | None:
     """The message of an error that is the user's to mend, on one line; None for a defect of this library."""
     if isinstance(error, UserError):
         return " ".join(str(error).split())
     if hasattr(error, "format_message"):  # typer's own, whichever click it is built on
         message = " ".join(error.format_message().split())
         return (
-            f"{message.rstrip('.')}; see refine --help."
+            f"{message.rstrip('.')}; see {command} --help."
             if message
             else "No photo is given; see refine --help."
         )

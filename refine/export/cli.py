@@ -19,7 +19,7 @@ FORMATS = ("png", "png8", "exr", "exr32")
 
 app = typer.Typer(add_completion=False, pretty_exceptions_enable=False, rich_markup_mode="rich")
 
-_LIST = "\n\n".join(f"[bold]{name}[/bold]  {target.help}" for name, target in TARGETS.items())
+_LIST = "; ".join(f"[bold]{name}[/bold]: {target.help}" for name, target in TARGETS.items()) + "."
 
 
 @app.command(epilog=_LIST)
