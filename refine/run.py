@@ -37,15 +37,17 @@ def run_stages(
         engine: a name in `refine.engine.ENGINES`; None takes the fastest for the device.
 
     Returns:
-        The material (the initialization itself, untouched, if the recipe has no iterations) and the losses
-        of every stage.
+        The material and the losses of every stage. If the recipe has no iterations, or a material at the very
+        ends of its range (`refine.parametrization`) explains the photos better than what the stages found,
+        it is the initialization itself, untouched.
 
     Raises:
         ValueError: a light is missing.
     """
     photos = [captures] if isinstance(captures, Capture) else list(captures)
     device = initial.normal.device
-    losses = {"initialization": [sum(distance_in_bands(initial, capture) for capture in photos)]}
+    start = _distance(initial, photos)
+    losses = {"initialization": [start]}
     if recipe.iterations == 0:
         return initial, losses
     engine = choose_engine(engine, device.type)
@@ -63,7 +65,12 @@ def run_stages(
         parameters, losses[label] = _run_stage(stage, parameters, photos, tell, engine)
         finished += stage.iterations
         seconds[label] = time.perf_counter() - clock
-    return parameters.svbrdf(), losses
+    refined = parameters.svbrdf()
+    return (initial if _distance(refined, photos) > start else refined), losses
+
+
+def _distance(svbrdf: SVBRDF, photos: Sequence[Capture]) -> float:
+    return sum(distance_in_bands(svbrdf, photo) for photo in photos)
 
 
 def _run_stage(
