@@ -20,6 +20,7 @@ class Capture:
         camera: sees the surface.
         light: if it is known; None to have it estimated.
         notes: what was done to the photo on the way here, in plain words.
+        source: file name of the photo, or `array`.
     """
 
     photo: Float[Tensor, "1 3 h w"]
@@ -27,3 +28,4 @@ class Capture:
     camera: Camera = field(default_factory=Camera)
     light: PointLight | None = None
     notes: tuple[str, ...] = ()
+    source: str = "array"

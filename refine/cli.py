@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import json
 import logging
-import math
 import sys
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -19,6 +18,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, cast, get_args
 import typer
 
 from refine import __version__
+from refine.arguments import choose, parse_camera, parse_point, require_device, require_sense
 from refine.console import progress_bar, summarise
 from refine.errors import UserError
 from refine.export.targets import parse_targets
@@ -32,9 +32,6 @@ SUBCOMMANDS: dict[str, str] = {"export": "refine.export.cli:app"}
 """Commands besides the default one, as `name: "module:typer_app"`; imported only when asked for."""
 
 QUICK_ITERATIONS = 50
-
-LARGEST_COORDINATE = 1e6
-"""Positions farther away than this, in surface units, are taken for mistakes."""
 
 app = typer.Typer(add_completion=False, pretty_exceptions_enable=False, rich_markup_mode="rich")
 
@@ -68,16 +65,23 @@ def _version(asked: bool) -> bool:
 
 @app.command()
 def fit(
-    photo: Annotated[Path, typer.Argument(metavar="PHOTO", help="JPEG, PNG, TIFF, EXR", show_default=False)],
+    photos: Annotated[
+        list[Path], typer.Argument(metavar="PHOTO", help="JPEG, PNG, TIFF, EXR", show_default=False)
+    ],
     light: Annotated[str, _surface("X,Y,Z", "Position of the flash (estimated)")] = "estimated",
-    falloff: Annotated[str, _surface("NAME", "(none), inverse_square, auto")] = "none",
-    camera: Annotated[
-        str, _surface("NAME", "(perspective), orthographic, collocated, X,Y,Z")
-    ] = "perspective",
+    falloff: Annotated[str | None, _surface("NAME", "(none), inverse_square, auto")] = None,
+    camera: Annotated[str | None, _surface("NAME", "(perspective), orthographic, collocated, X,Y,Z")] = None,
     color_space: Annotated[
         str, _surface("NAME", "(auto), srgb, linear, gamma22, display-p3, adobe-rgb")
     ] = "auto",
     resolution: Annotated[int, _surface("PIXELS", "Longer side (256); 0 keeps the photo's")] = 256,
+    one_surface: Annotated[
+        bool, _switch("--one-surface", help="The photos show one, in register", panel="The photo")
+    ] = False,
+    align: Annotated[
+        bool, _switch("--align", help="Bring them into register first", panel="The photo")
+    ] = False,
+    lights: Annotated[Path | None, _surface("PATH", "Positions of their flashes (estimated)")] = None,
     init: Annotated[str, _refinement("NAME|FILE", "Network to start from (default)")] = "default",
     recipe: Annotated[str, _refinement("NAME", "Stages of refinement (default), fast, paper")] = "default",
     iters: Annotated[int | None, _refinement("N", "Steps of all stages (the recipe's); 0 for none")] = None,
@@ -102,21 +106,26 @@ def fit(
         bool, _switch("--version", help="Print the version", callback=_version, is_eager=True)
     ] = False,
 ) -> None:
-    """Turn one flash photo of a flat surface into a relightable material.
+    """Turn flash photos of a flat surface into a relightable material.
 
     Writes <photo>_normal.png, _diffuse, _specular, _roughness and _rendering,
-    <photo>.json and <photo>_report.png. Defaults are in parentheses.
+    <photo>.json and <photo>_report.png. Defaults are in parentheses; those of
+    --one-surface are --camera collocated --falloff inverse_square.
     """
+    photo = photos[0]
+    require_sense(photos, one_surface=one_surface, light=light, align=align, lights=lights)
+    camera = camera or ("collocated" if one_surface else "perspective")
+    falloff = falloff or ("inverse_square" if one_surface else "none")
     position = (
         None
         if light == "estimated"
         else parse_point("--light", light, "or leave it out to have it estimated")
     )
     kind, viewpoint = parse_camera(camera)
-    _choose("--falloff", falloff, ("none", "inverse_square", "auto"))
-    if falloff == "auto" and position is not None:
-        raise UserError("--falloff auto needs a light to fit; leave out --light or name the falloff.")
-    _choose("--normals", normals, ("opengl", "directx"))
+    choose("--falloff", falloff, ("none", "inverse_square", "auto"))
+    if falloff == "auto" and (position is not None or lights is not None):
+        raise UserError("--falloff auto needs a light to fit; leave out --light(s) or name the falloff.")
+    choose("--normals", normals, ("opengl", "directx"))
     for name, number, lowest in (("iters", iters, 0), ("resolution", resolution, 0), ("threads", threads, 1)):
         if number is not None and not lowest <= number < 2**31:
             raise UserError(f"--{name} {number} is out of range; give {lowest} or more.")
@@ -132,22 +141,23 @@ def fit(
     from nets.render import Camera, PointLight
     from refine.engine import ENGINES, obstacle
     from refine.export.cli import export_folder
+    from refine.known_lights import read_lights
     from refine.light import FalloffChoice
     from refine.photo import ColorSpaceChoice, read_photo
     from refine.refiner import Refiner
     from refine.result import MAP_FORMATS, Output, describe, describe_checkpoint, write_result
     from refine.stages import RECIPES
 
-    _choose("--color-space", color_space, get_args(ColorSpaceChoice))
-    _choose("--recipe", recipe, tuple(RECIPES))
-    _choose("--format", format, tuple(MAP_FORMATS))
-    _choose("--engine", engine, ("auto", *ENGINES))
-    _require_device(device)
+    choose("--color-space", color_space, get_args(ColorSpaceChoice))
+    choose("--recipe", recipe, tuple(RECIPES))
+    choose("--format", format, tuple(MAP_FORMATS))
+    choose("--engine", engine, ("auto", *ENGINES))
+    require_device(device)
     if engine != "auto" and (reason := obstacle(engine, torch.device(device).type)) is not None:
         raise UserError(f"--engine {engine} cannot be used: {reason}; leave --engine or --device out.")
     if threads is not None:
         torch.set_num_threads(threads)
-    read = read_photo(photo, color_space=cast(ColorSpaceChoice, color_space))
+    reads = [read_photo(path, color_space=cast(ColorSpaceChoice, color_space)) for path in photos]
     output = Output(
         out if out is not None else Path(f"{photo.stem}_material"),
         photo.stem,
@@ -155,7 +165,8 @@ def fit(
         cast(Literal["opengl", "directx"], normals),
         report=not no_report,
     )
-    output.require_writable(photo)
+    for path in photos:
+        output.require_writable(path)
     checkpoint = describe_checkpoint(init)
     seen_from = Camera(kind) if viewpoint is None else Camera(kind, viewpoint)
     refiner = Refiner(
@@ -168,8 +179,11 @@ def fit(
         engine=None if engine == "auto" else engine,
     )
     flash: PointLight | None = None
+    known_falloff = cast(Literal["none", "inverse_square"], falloff)
     if position is not None:
-        flash = PointLight.at(position, falloff=cast(Literal["none", "inverse_square"], falloff)).to(device)
+        flash = PointLight.at(position, falloff=known_falloff).to(device)
+    elif lights is not None:
+        flash = read_lights(lights, photos, known_falloff)
 
     settings = {
         "init": init,
@@ -178,6 +192,9 @@ def fit(
         "engine": engine,
         "resolution": resolution,
         "light": light,
+        "one_surface": one_surface,
+        "align": align,
+        "lights": None if lights is None else lights.name,
         "falloff": falloff,
         "camera": camera,
         "color_space": color_space,
@@ -188,72 +205,24 @@ def fit(
         "threads": torch.get_num_threads(),
     }
     with progress_bar(shown=not quiet and sys.stderr.isatty()) as progress, _enough_memory(), _log(quiet):
-        refined = refiner.fit(
-            read,
-            light=flash,
-            falloff=None if flash else cast(FalloffChoice, falloff),
-            iters=iters,
-            progress=progress,
-        )
-        record = describe(refined, output, settings=settings, checkpoint=checkpoint, photo=read)
+        unknown_falloff = None if flash else cast(FalloffChoice, falloff)
+        if one_surface:
+            refined = refiner.fit_many(
+                reads, lights=flash, falloff=unknown_falloff, align=align, iters=iters, progress=progress
+            )
+        else:
+            refined = refiner.fit(
+                reads[0], light=flash, falloff=unknown_falloff, iters=iters, progress=progress
+            )
+        record = describe(refined, output, settings=settings, checkpoint=checkpoint, photo=reads[0])
         paths = write_result(refined, output, record)
     if as_json:
         json.dump({**record, "folder": str(output.folder)}, sys.stdout, indent=2)
         print()
     if not quiet:
-        summarise(record, paths, estimated=position is None)
+        summarise(record, paths, estimated=flash is None)
     if targets:
         export_folder(output.folder, targets, name=output.stem, quiet=quiet)
-
-
-def parse_point(option: str, text: str, otherwise: str) -> tuple[float, float, float]:
-    """Read `X,Y,Z` in surface units, above the surface.
-
-    Raises:
-        UserError: text of another form, or a point that is not in front of the surface.
-    """
-    try:
-        x, y, z = (float(number) for number in text.split(","))
-    except ValueError:
-        raise UserError(
-            f"{option} {text!r} is not a position; give X,Y,Z such as 0.1,-0.2,2.1, {otherwise}."
-        ) from None
-    if not all(math.isfinite(value) and abs(value) <= LARGEST_COORDINATE for value in (x, y, z)) or z < 1e-3:
-        raise UserError(
-            f"{option} {text!r} is not in front of the surface; "
-            "give X,Y,Z with Z above 0 (the photo's longer side spans -1 to 1)."
-        )
-    return x, y, z
-
-
-CameraKind = Literal["orthographic", "perspective", "collocated"]
-
-
-def parse_camera(text: str) -> tuple[CameraKind, tuple[float, float, float] | None]:
-    """Read a camera's kind, or the position of a perspective one.
-
-    Raises:
-        UserError: neither.
-    """
-    if text in get_args(CameraKind):
-        return cast(CameraKind, text), None
-    return "perspective", parse_point("--camera", text, "or orthographic, perspective or collocated")
-
-
-def _choose(option: str, value: str, known: Sequence[str]) -> None:
-    if value not in known:
-        raise UserError(f"{option} {value!r} is unknown; choose one of {', '.join(known)}.")
-
-
-def _require_device(name: str) -> None:
-    import torch
-
-    try:
-        if torch.device(name).type not in ("cpu", "cuda", "mps", "xpu"):
-            raise RuntimeError
-        torch.zeros(1, device=name).item()
-    except (RuntimeError, AssertionError, NotImplementedError, ImportError):
-        raise UserError(f"--device {name!r} is not there on this machine; use --device cpu.") from None
 
 
 @contextmanager

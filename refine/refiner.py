@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -15,14 +16,19 @@ from nets.checkpoint import load_model
 from nets.ensemble import FlipAverage
 from nets.render import Camera, PointLight
 from nets.svbrdf import SVBRDF
+from refine.alignment import align as align_photos
+from refine.alignment import require_one_size
 from refine.bands import render_in_bands
+from refine.calibration import SelfCalibration
 from refine.capture import Capture
 from refine.engine import choose_engine
+from refine.errors import UserError
 from refine.initialization import Predict, Predictor, initialize
 from refine.light import FalloffChoice, check_falloff, fit_light, fit_light_and_falloff
 from refine.maps import MapFormat, NormalConvention, write_maps
 from refine.photo import ColorSpaceChoice, Photo, photo_from_array, read_photo, resize_photo
 from refine.run import Report, run_stages
+from refine.several import complete, find_lights, initialize_together
 from refine.stages import Recipe, find_recipe
 
 DEFAULT_RESOLUTION = 256
@@ -48,6 +54,7 @@ class Refined:
         source: file name of the photo, or `array`.
         settings: what else is worth knowing of how it was made.
         engine: that ran the stages, see `refine.engine`.
+        others: further photos of the surface, each with its light; `capture` is the first.
     """
 
     svbrdf: SVBRDF
@@ -62,6 +69,7 @@ class Refined:
     source: str = "array"
     settings: dict[str, Any] = field(default_factory=dict)
     engine: str = "reference"
+    others: tuple[Capture, ...] = ()
 
     def render(self, light: PointLight | None = None, camera: Camera | None = None) -> Tensor:
         """Render the refined maps, linear `[1, 3, H, W]`; defaults to the photo's light and camera."""
@@ -112,7 +120,8 @@ class Refiner:
             model: a checkpoint's name or path, or any callable from a linear photo `[1, 3, 256, 256]` to
                 an `SVBRDF` of that size and a `PointLight`.
             recipe: a name in `refine.stages.RECIPES`, or a `Recipe`.
-            camera: how the photo was taken; the authors' perspective camera by default.
+            camera: how photos were taken; by default the authors' perspective camera for one photo, and at
+                the flash for several.
             resolution: longer side of the maps in pixels; None keeps the photo's.
             flips: average a named checkpoint's guess over four mirrored photos (`nets.ensemble`).
             seed: of everything random, for models or recipes that draw numbers.
@@ -132,6 +141,7 @@ class Refiner:
         self.model = model
         self.recipe = find_recipe(recipe) if isinstance(recipe, str) else recipe
         self.camera = camera or Camera()
+        self.camera_of_several = camera or Camera("collocated")
         self.resolution = resolution
         self.seed = seed
 
@@ -165,14 +175,8 @@ class Refiner:
         check_falloff(falloff)
         torch.manual_seed(self.seed)
         recipe = self.recipe if iters is None else self.recipe.with_iterations(iters)
-        photo = _photo(img, color_space)
-        if self.resolution is not None:
-            photo = resize_photo(photo, self.resolution)
-        # Light of 1 and more is clipped, whatever the file's own range is: it only says "at least 1".
-        unsaturated = photo.unsaturated & (photo.linear < 1.0).all(dim=1, keepdim=True)
-        capture = Capture(
-            photo.linear.clamp(max=1.0).to(self.device), unsaturated.to(self.device), self.camera, light
-        )
+        photo = self._resized(_photo(img, color_space))
+        capture = self._capture(photo, self.camera, light)
         seconds: dict[str, float] = {}
 
         clock = time.perf_counter()
@@ -202,6 +206,92 @@ class Refiner:
             photo.source,
             engine=self.engine,
         )
+
+    def fit_many(
+        self,
+        imgs: Sequence[str | Path | Photo | np.ndarray | Tensor],
+        *,
+        lights: PointLight | None = None,
+        falloff: FalloffChoice = None,
+        align: bool = False,
+        iters: int | None = None,
+        color_space: ColorSpaceChoice = "auto",
+        progress: Report | None = None,
+        calibration: SelfCalibration | None = None,
+    ) -> Refined:
+        """Recover the material of one surface from several photos under different lights.
+
+        Args:
+            imgs: two or more, each as `fit` takes it.
+            lights: where the flash was, one per photo as a batch, if known; only each photo's exposure is
+                fitted then. Otherwise lights and exposures are found together (`refine.calibration`).
+            falloff: of lights that are not known; None is a real flash's, `inverse_square`.
+            align: bring hand-held photos into register with the first (`refine.alignment`).
+            iters: as in `fit`.
+            color_space: as in `fit`.
+            progress: as in `fit`.
+            calibration: settings of the search for the lights.
+
+        Returns:
+            The result, whose photo and light are the first one's.
+
+        Raises:
+            refine.errors.UserError: a photo cannot be read or used, sizes differ, or alignment fails.
+            ValueError: if `iters` is negative, for an unknown falloff, or for another number of lights.
+        """
+        check_falloff(falloff)
+        if len(imgs) < 2:
+            raise UserError("One surface in several photos needs two or more; give more, or use one alone.")
+        if lights is not None and len(lights.position) != len(imgs):
+            raise ValueError(f"{len(lights.position)} lights are given for {len(imgs)} photos")
+        torch.manual_seed(self.seed)
+        recipe = self.recipe if iters is None else self.recipe.with_iterations(iters)
+        photos = [self._resized(_photo(img, color_space)) for img in imgs]
+        seconds: dict[str, float] = {}
+
+        clock = time.perf_counter()
+        if align:
+            photos, visible = align_photos(photos)
+            visible = [seen.to(self.device) for seen in visible]
+            seconds["alignment"] = time.perf_counter() - clock
+        else:
+            require_one_size(photos)
+            visible = [torch.ones_like(photo.unsaturated, device=self.device) for photo in photos]
+        captures = [self._capture(photo, self.camera_of_several) for photo in photos]
+
+        clock = time.perf_counter()
+        initial = initialize_together(self.model, captures, visible)
+        seconds["initialization"] = time.perf_counter() - clock
+
+        clock = time.perf_counter()
+        found = find_lights(initial, captures, falloff, lights, calibration or SelfCalibration())
+        seconds["lights"] = time.perf_counter() - clock
+        lit = [replace(capture, light=light) for capture, light in zip(captures, found, strict=True)]
+        lit = [complete(capture, seen, initial) for capture, seen in zip(lit, visible, strict=True)]
+        svbrdf, losses = run_stages(initial, lit, recipe, seconds, progress, self.engine)
+        return Refined(
+            svbrdf.detach(),
+            initial,
+            found[0],
+            self.camera_of_several,
+            lit[0],
+            losses,
+            seconds,
+            recipe,
+            (*photos[0].notes, f"the first of {len(photos)} photos of one surface"),
+            photos[0].source,
+            engine=self.engine,
+            others=tuple(lit[1:]),
+        )
+
+    def _resized(self, photo: Photo) -> Photo:
+        return photo if self.resolution is None else resize_photo(photo, self.resolution)
+
+    def _capture(self, photo: Photo, camera: Camera, light: PointLight | None = None) -> Capture:
+        # Light of 1 and more is clipped, whatever the file's own range is: it only says "at least 1".
+        unsaturated = photo.unsaturated & (photo.linear < 1.0).all(dim=1, keepdim=True)
+        linear = photo.linear.clamp(max=1.0).to(self.device)
+        return Capture(linear, unsaturated.to(self.device), camera, light, photo.notes, photo.source)
 
 
 def _photo(img: str | Path | Photo | np.ndarray | Tensor, color_space: ColorSpaceChoice) -> Photo:

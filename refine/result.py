@@ -20,8 +20,10 @@ import numpy as np
 import torch
 
 from nets.checkpoint import read_record, resolve
+from nets.render import PointLight
 from refine import __version__
 from refine.bands import render_in_bands
+from refine.capture import Capture
 from refine.errors import UserError
 from refine.fidelity import rerendering_rmse
 from refine.files import write_together
@@ -152,9 +154,6 @@ def describe(
     )
     after = rerendering_rmse(refined.render(), refined.capture)
     height, width = refined.svbrdf.size
-    position, intensity = (
-        [float(value) for value in tensor[0]] for tensor in (refined.light.position, refined.light.intensity)
-    )
     return {
         "format": FORMAT,
         "photo": {
@@ -165,11 +164,12 @@ def describe(
             "saturated": 1.0 - float(photo.unsaturated.double().mean()),
             "notes": list(refined.notes),
         },
+        **({"others": [_other(refined, capture) for capture in refined.others]} if refined.others else {}),
         "settings": {**settings, **refined.settings},
         "recipe": refined.recipe.as_dict(),
         "engine": refined.engine,
         "checkpoint": checkpoint,
-        "light": {"position": position, "intensity": intensity, "falloff": refined.light.falloff},
+        "light": _light(refined.light),
         "camera": asdict(refined.camera),
         "maps": {
             "width": width,
@@ -185,6 +185,29 @@ def describe(
         "losses": {name: _loss(values) for name, values in refined.losses.items()},
         "versions": versions(),
         SECONDS: {name: round(value, 3) for name, value in refined.seconds.items()},
+    }
+
+
+def _light(light: PointLight) -> dict[str, Any]:
+    position, intensity = (
+        [float(value) for value in tensor[0]] for tensor in (light.position, light.intensity)
+    )
+    return {"position": position, "intensity": intensity, "falloff": light.falloff}
+
+
+def _other(refined: Refined, capture: Capture) -> dict[str, Any]:
+    """What is known of a further photo of the surface."""
+    assert capture.light is not None
+    before, after = (
+        rerendering_rmse(render_in_bands(material, capture.light, capture.camera), capture)
+        for material in (refined.initial, refined.svbrdf)
+    )
+    return {
+        "source": capture.source,
+        "sha256": _sha256(Path(capture.source)) if capture.source != "array" else None,
+        "notes": list(capture.notes),
+        "light": _light(capture.light),
+        "rmse": {"initialization": before, "refined": after},
     }
 
 
