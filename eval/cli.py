@@ -15,6 +15,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from eval.ablations import ablation_estimator
+from eval.calibration import calibration_markdown, evaluate_calibration, lights_finder, measured_scenes
 from eval.datasets import NOVEL_LIGHTS, SIZE, Protocol, spread
 from eval.development import (
     DEVELOPMENT,
@@ -244,6 +245,29 @@ def photos(
         json_file.write_text(json.dumps(record, indent=1) + "\n", encoding="utf-8")
     if skipped:
         raise typer.Exit(INCOMPLETE)
+
+
+@main.command()
+def calibration(
+    data: Annotated[Path, typer.Option(help="Holds photos/multi_dev.")],
+    init: Checkpoint = "default",
+    size: Size = SIZE,
+    flips: Flips = True,
+    threads: Threads = 0,
+    json_file: JsonFile = None,
+    markdown_file: MarkdownFile = None,
+) -> None:
+    """Score the self-calibration of several photos' lights where they were measured."""
+    _use_threads(threads)
+    with _mistakes():
+        scenes = measured_scenes(data / "photos/multi_dev")
+        refiner = Refiner(init, resolution=size, flips=flips)
+
+    about = provenance()
+    with _progress(len(scenes)) as tell:
+        results = evaluate_calibration(lights_finder(refiner), scenes, tell)
+    results.settings |= {"init": init, "flips": flips, "size": size, **about}
+    _finish(results, calibration_markdown(results), json_file, markdown_file)
 
 
 def _use_threads(count: int) -> None:
