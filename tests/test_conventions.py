@@ -57,6 +57,8 @@ from nets.svbrdf import CHANNELS, MAPS, SVBRDF
 from nets.training import TrainingBatch
 from refine.capture import Capture
 from refine.errors import UserError
+from refine.export import packed
+from refine.export.bundle import TEXTURES, Picture, Source
 from refine.fidelity import rerendering_rmse
 from refine.initialization import NETWORK_SIZE, initialize
 from refine.maps import MapFormat, NormalConvention, read_maps, write_maps
@@ -1070,6 +1072,63 @@ def test_rerendering_rmse() -> None:
         float((encoded(rendering) - encoded(photo)).movedim(1, -1)[unsaturated[:, 0]].square().mean().sqrt()),
         rel=1e-3,
     )
+
+
+# Exports
+
+
+@states(
+    "C53",
+    "Where a model lays the lobe over the diffuse (glTF, Blender, MaterialX), base colour is `d (1 - s) / (1 "
+    "- max s)`, clipped at 1; the diffuse colour of USD's preview surface is d.",
+)
+def test_base_color_of_exports() -> None:
+    material = random_svbrdf()
+    strongest = material.specular.max(dim=1, keepdim=True).values
+    expected = (material.diffuse * (1.0 - material.specular) / (1.0 - strongest)).clamp(max=1.0)
+    assert_close(TEXTURES["base_color"].pixels(material), expected)
+    assert_close(TEXTURES["diffuse"].pixels(material), material.diffuse)
+
+
+@states(
+    "C54",
+    "In the metallic workflow the diffuse is `b (1 - m)` and F0 = 0.04 (1 - m) + b m; an ORM picture holds "
+    "occlusion, roughness and metallic in red, green and blue, raw.",
+)
+def test_metallic_workflow() -> None:
+    base, metallic, roughness = 0.4, 0.3, 0.7
+    f0 = 0.04 * (1.0 - metallic) + base * metallic
+    diffuse = base * (1.0 - metallic) / (1.0 - f0)
+    material = SVBRDF.constant(2, 2, diffuse=diffuse, roughness=roughness, specular=f0)
+    source = Source(material, "stone")
+    files = packed.orm(source).files
+    mixed, color = files[source.file("orm")], files[source.file("metallic_base_color")]
+    assert isinstance(mixed, Picture)
+    assert isinstance(color, Picture)
+    assert not mixed.color
+    assert_close(mixed.pixels[0, :, 0, 0], torch.tensor([1.0, roughness, metallic]))
+    assert_close(color.pixels[0, :, 0, 0], torch.tensor([base] * 3))
+
+
+@states(
+    "C55",
+    "A height is in surface units and grows towards the viewer; 0 and 1 of a height file are the `low` and "
+    "`high` of its record.",
+)
+def test_height_file() -> None:
+    slope = 0.1  # up to the right: the normal leans to the left
+    normal = torch.tensor([-slope, 0.0, 1.0]) / math.sqrt(1.0 + slope**2)
+    flat = SVBRDF.constant(8, 64)
+    tilted = SVBRDF(
+        normal[None, :, None, None].expand(1, 3, 8, 64), flat.diffuse, flat.roughness, flat.specular
+    )
+    source = Source(tilted, "stone")
+    bundle = packed.height(source)
+    picture = bundle.files[source.file("height")]
+    assert isinstance(picture, Picture)
+    heights = bundle.notes["low"] + picture.pixels * (bundle.notes["high"] - bundle.notes["low"])
+    centre = heights[0, 0, 4, 16:48]
+    assert_close(centre.diff(), torch.full((31,), slope * 2.0 / 64), rtol=0.1)
 
 
 # The other pages

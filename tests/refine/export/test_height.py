@@ -7,6 +7,7 @@ import pytest
 import torch
 from torch import Tensor
 
+from nets.data.procedural import generate
 from refine.export.height import height_from_normals, relief
 
 AMPLITUDE = 0.05
@@ -75,3 +76,12 @@ def test_relief_says_what_its_values_mean() -> None:
     np.testing.assert_allclose(found.low + found.picture * (found.high - found.low), heights)
     flat = relief(np.zeros((3, 3)))
     assert (flat.low, flat.high, float(flat.picture.mean())) == (0.0, 0.0, 0.5)
+
+
+def test_the_relief_of_a_generated_wall_is_recovered() -> None:
+    """Its normals are central differences of a known height: the courses and their depth come back."""
+    wall = generate("slate", 96, 3)
+    found = height_from_normals(torch.from_numpy(wall.normal).movedim(-1, 0)[None])
+    known = wall.height - wall.height.mean()
+    assert np.corrcoef(found.ravel(), known.ravel())[0, 1] > 0.99
+    assert found.std() == pytest.approx(known.std(), rel=0.05)
