@@ -94,6 +94,9 @@ def fit(
     out: Annotated[Path | None, _output("DIR", "Folder (./<photo>_material)")] = None,
     format: Annotated[str, _output("NAME", "(png), png8, tif, tif8, tif32, exr, exr32")] = "png",
     normals: Annotated[str, _output("NAME", "(opengl): green is up, directx: down")] = "opengl",
+    uncertainty: Annotated[
+        bool, _switch("--uncertainty", help="Say how well each pixel is known, too", panel="Output")
+    ] = False,
     no_report: Annotated[bool, _switch("--no-report", help="No <photo>_report.png", panel="Output")] = False,
     export: Annotated[
         str | None, _output("NAME,NAME", "For other programs, too: see refine export --help")
@@ -108,9 +111,8 @@ def fit(
 ) -> None:
     """Turn flash photos of a flat surface into a relightable material.
 
-    Writes <photo>_normal.png, _diffuse, _specular, _roughness and _rendering,
-    <photo>.json and <photo>_report.png. Defaults are in parentheses; those of
-    --one-surface are --camera collocated --falloff inverse_square.
+    Writes <photo>_normal.png, four more images, <photo>.json and a report.
+    Defaults are in parentheses; --one-surface is collocated, inverse_square.
     """
     photo = photos[0]
     require_sense(photos, one_surface=one_surface, light=light, align=align, lights=lights)
@@ -164,6 +166,7 @@ def fit(
         format,
         cast(Literal["opengl", "directx"], normals),
         report=not no_report,
+        uncertainty=uncertainty,
     )
     for path in photos:
         output.require_writable(path)

@@ -5,11 +5,13 @@ from __future__ import annotations
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
 from nets.checkpoint import load_model
@@ -30,6 +32,7 @@ from refine.photo import ColorSpaceChoice, Photo, photo_from_array, read_photo, 
 from refine.run import Report, run_stages
 from refine.several import complete, find_lights, initialize_together
 from refine.stages import Recipe, find_recipe
+from refine.uncertainty import deviations
 
 DEFAULT_RESOLUTION = 256
 """Longer side of the maps, pixels: what the network was trained on."""
@@ -74,6 +77,16 @@ class Refined:
     def render(self, light: PointLight | None = None, camera: Camera | None = None) -> Tensor:
         """Render the refined maps, linear `[1, 3, H, W]`; defaults to the photo's light and camera."""
         return render_in_bands(self.svbrdf, light or self.light, camera or self.camera)
+
+    @cached_property
+    def deviations(self) -> dict[str, Float[Tensor, "1 1 h w"]]:
+        """How far each map is likely to be off, by map name, in its units; see `refine.uncertainty`.
+
+        Computed when it is first asked for. The errors it expects beforehand were measured with the shipped
+        network and the recipe `default`; with others it is a rougher guess.
+        """
+        photos = [replace(self.capture, light=self.light), *self.others]
+        return deviations(self.initial, self.svbrdf, photos)
 
     def save(
         self,

@@ -27,7 +27,15 @@ from refine.capture import Capture
 from refine.errors import UserError
 from refine.fidelity import rerendering_rmse
 from refine.files import write_together
-from refine.maps import RENDERING, MapFormat, NormalConvention, map_paths, write_maps
+from refine.maps import (
+    MAP_NAMES,
+    RENDERING,
+    MapFormat,
+    NormalConvention,
+    map_paths,
+    write_image,
+    write_maps,
+)
 from refine.photo import Photo
 from refine.refiner import Refined
 from refine.report.sheet import write_sheet
@@ -59,6 +67,7 @@ class Output:
         format: a name in `MAP_FORMATS`.
         normals: what the green channel of the normal file means.
         report: whether `<stem>_report.png` is written.
+        uncertainty: whether `<stem>_normal_deviation` and so on are written, and drawn in the report.
     """
 
     folder: Path
@@ -66,10 +75,16 @@ class Output:
     format: str = "png"
     normals: NormalConvention = "opengl"
     report: bool = True
+    uncertainty: bool = False
 
     def paths(self) -> dict[str, Path]:
-        """Return every file of the result: the maps by name, `rendering`, `json` and perhaps `report`."""
-        paths = map_paths(self.folder, self.stem, format=MAP_FORMATS[self.format])
+        """Return every file of the result: maps and deviations by name, `rendering`, `json`, `report`."""
+        format = MAP_FORMATS[self.format]
+        paths = map_paths(self.folder, self.stem, format=format)
+        if self.uncertainty:
+            for name in MAP_NAMES:
+                key = _deviation(name)
+                paths[key] = self.folder / f"{self.stem}_{key}.{format.extension}"
         paths["json"] = self.folder / f"{self.stem}.json"
         if self.report:
             paths["report"] = self.folder / f"{self.stem}_report.png"
@@ -123,9 +138,19 @@ def write_result(refined: Refined, output: Output, record: dict[str, Any]) -> di
             )
             for name, path in maps.items():
                 os.replace(path, temporaries[name])
+        if output.uncertainty:
+            for name, deviation in refined.deviations.items():
+                key, pixels = _deviation(name), deviation[0].permute(1, 2, 0).cpu().float().numpy()
+                write_image(
+                    temporaries[key],
+                    paths[key],
+                    np.ascontiguousarray(pixels),
+                    "data",
+                    MAP_FORMATS[output.format],
+                )
         temporaries["json"].write_text(to_json(record), encoding="utf-8", newline="\n")
         if output.report:
-            write_sheet(temporaries["report"], refined)
+            write_sheet(temporaries["report"], refined, uncertainty=output.uncertainty)
     return paths
 
 
@@ -217,13 +242,21 @@ def map_encodings(output: Output) -> dict[str, str]:
     color = "linear Rec. 709" if format.linear else "sRGB-encoded"
     green = {"opengl": "green up (OpenGL)", "directx": "green down (DirectX)"}[output.normals]
     storage = f"{format.bits}-bit {'float ' if format.linear else ''}{format.extension}"
-    return {
+    encodings = {
         "normal": f"(n + 1) / 2, raw, {green}; {storage}",
         "diffuse": f"albedo, {color}; {storage}",
         "specular": f"reflectance at normal incidence (F0), {color}; {storage}",
         "roughness": f"raw, GGX alpha is its square; {storage}",
         RENDERING: f"radiance, {color}{'' if format.linear else ', clipped at 1'}; {storage}",
     }
+    if output.uncertainty:
+        meaning = "standard deviation of the map's error, in linear units of the map"
+        encodings |= {_deviation(name): f"{meaning}, raw; {storage}" for name in MAP_NAMES}
+    return encodings
+
+
+def _deviation(name: str) -> str:
+    return f"{name}_deviation"
 
 
 def describe_checkpoint(name: str | Path) -> dict[str, Any]:

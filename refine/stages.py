@@ -173,8 +173,8 @@ class Recipe:
 
 
 LONG_GLOBAL = GlobalStage(160, Rates(diffuse=0.02, specular=0.02))
-"""Of the `default` recipe: the diffuse takes part, or its error would be left to the specular. Roughness does not:
-one photo tells both from each other badly, and moved as a whole it moves away from the truth as often as not."""
+"""Of the `default` recipe: the diffuse takes part, or its error would be left to the specular. Roughness does
+not: one photo tells it from specular badly, and as a whole it moves away from the truth as often as not."""
 
 RECIPES: dict[str, Recipe] = {
     "default": Recipe("default", stages=(LONG_GLOBAL, PosteriorStage())),

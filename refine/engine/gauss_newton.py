@@ -84,14 +84,7 @@ def solve(
     variance = _variances(widths, middle) * moves
 
     def residuals(offset: Float[Tensor, "1 9 h w"]) -> Float[Tensor, "1 n h w"]:
-        material = unstack(middle + offset).svbrdf()
-        return torch.cat(
-            [
-                log_residual(shade(material, geometry, conventions), photo.photo, photo.unsaturated)
-                for photo, geometry in zip(captures, geometries, strict=True)
-            ],
-            dim=1,
-        )
+        return _residuals(middle + offset, captures, geometries, conventions)
 
     def cost_of(offset: Tensor, found: Tensor) -> Float[Tensor, "1 1 h w"]:
         scaled = found.abs() / noise
@@ -120,10 +113,38 @@ def solve(
             progress(iteration + 1, history[-1])
     found, jacobian = _linearised(residuals, offset)
     history.append(_distance(found))
-    gain, told = _gain(jacobian, found, variance.expand_as(offset), noise, huber)
-    known = torch.einsum("bhwkn,bnkhw->bkhw", gain, told)
-    deviations = (variance - known).clamp(min=0.0).sqrt()
+    deviations = _deviations(jacobian, found, variance.expand_as(offset), noise, huber)
     return Posterior(unstack(middle + offset), unstack(deviations), objective, history)
+
+
+def posterior_deviations(
+    parameters: Parameters,
+    capture: Capture | Sequence[Capture],
+    geometry: Geometry | Sequence[Geometry] | None = None,
+    *,
+    widths: Parameters,
+    noise: float,
+    huber: float,
+    conventions: Conventions = PAPER,
+) -> Parameters:
+    """Return the standard deviations that photos leave to parameters, by the curvature where they are.
+
+    Args:
+        parameters: the most probable ones.
+        capture: as in `solve`.
+        geometry: as there.
+        widths: standard deviation of each parameter before the photos are looked at, pixel by pixel.
+        noise: as in `solve`.
+        huber: as there.
+        conventions: as there.
+    """
+    captures, geometries = several(capture, geometry, conventions)
+    middle = stack(parameters)
+    found, jacobian = _linearised(
+        lambda offset: _residuals(middle + offset, captures, geometries, conventions),
+        torch.zeros_like(middle),
+    )
+    return unstack(_deviations(jacobian, found, stack(widths) ** 2, noise, huber))
 
 
 def stack(parameters: Parameters) -> Float[Tensor, "1 9 h w"]:
@@ -139,6 +160,31 @@ def unstack(channels: Float[Tensor, "1 9 h w"]) -> Parameters:
 def _variances(widths: Mapping[str, float], like: Tensor) -> Float[Tensor, "1 9 1 1"]:
     values = [widths.get(name, 0.0) ** 2 for name in MAPS for _ in range(PARAMETER_COUNTS[name])]
     return like.new_tensor(values)[None, :, None, None]
+
+
+def _residuals(
+    parameters: Float[Tensor, "1 9 h w"],
+    captures: Sequence[Capture],
+    geometries: Sequence[Geometry],
+    conventions: Conventions,
+) -> Float[Tensor, "1 n h w"]:
+    material = unstack(parameters).svbrdf()
+    return torch.cat(
+        [
+            log_residual(shade(material, geometry, conventions), photo.photo, photo.unsaturated)
+            for photo, geometry in zip(captures, geometries, strict=True)
+        ],
+        dim=1,
+    )
+
+
+def _deviations(
+    jacobian: Tensor, found: Tensor, variance: Float[Tensor, "1 9 h w"], noise: float, huber: float
+) -> Float[Tensor, "1 9 h w"]:
+    """Return the diagonal of the posterior's covariance, as deviations."""
+    gain, told = _gain(jacobian, found, variance, noise, huber)
+    known = torch.einsum("bhwkn,bnkhw->bkhw", gain, told)
+    return (variance - known).clamp(min=0.0).sqrt()
 
 
 def _linearised(residuals, offset: Tensor) -> tuple[Float[Tensor, "1 n h w"], Float[Tensor, "1 n 9 h w"]]:  # type: ignore[no-untyped-def]

@@ -39,23 +39,29 @@ NOVEL_LIGHTS = ((-0.7, 0.7), (0.7, 0.7), (0.7, -0.7), (-0.7, -0.7))
 """Where the novel lights are, as shares of the half width and half height of the surface."""
 NOVEL_HEIGHT = 1.3
 DIFFERENCE_GAIN = 4.0
-"""Differences are shown this much brighter than they are."""
+"""Differences and deviations are shown this much brighter than they are."""
 
 INK, FAINT = "#202020", "#707070"
 STAGE_COLORS = ("#c0562b", "#1f6f8b", "#5b8c3e", "#7a4f9a", "#a08020", "#404040")
 
 
-def write_sheet(path: Path | str, refined: Refined) -> None:
-    """Draw the sheet of a result and write it as PNG; the same result gives the same bytes."""
+def write_sheet(path: Path | str, refined: Refined, *, uncertainty: bool = False) -> None:
+    """Draw the sheet of a result and write it as PNG; the same result gives the same bytes.
+
+    Args:
+        path: of the picture.
+        refined: the result.
+        uncertainty: whether a row shows how well each map is known.
+    """
     with matplotlib.style.context("default"):
-        figure = draw_sheet(refined)
+        figure = draw_sheet(refined, uncertainty=uncertainty)
         FigureCanvasAgg(figure).print_png(str(path), metadata={"Software": None})
 
 
-def draw_sheet(refined: Refined) -> Figure:
-    """Return the sheet as a figure of `DPI` dots per inch."""
+def draw_sheet(refined: Refined, *, uncertainty: bool = False) -> Figure:
+    """Return the sheet as a figure of `DPI` dots per inch; arguments as `write_sheet`."""
     height, width = refined.svbrdf.size
-    sheet = _Sheet(height, width)
+    sheet = _Sheet(height, width, ROWS + uncertainty)
     photo = refined.capture.photo
     before = render_in_bands(refined.initial, refined.light, refined.camera)
     after = refined.render()
@@ -82,28 +88,34 @@ def draw_sheet(refined: Refined) -> Figure:
         for column, map_name in enumerate(MAPS):
             image, fact = _map_picture(material, map_name)
             sheet.picture(row, column, image, f"{name} {map_name}", fact)
+    if uncertainty:
+        for column, map_name in enumerate(MAPS):
+            deviation = refined.deviations[map_name]
+            fact = f"mean {float(deviation.mean()):.3f}, drawn x {DIFFERENCE_GAIN:g}"
+            sheet.picture(3, column, deviation * DIFFERENCE_GAIN, f"{map_name} deviation", fact)
+    last = ROWS - 1 + uncertainty
     for column, position in enumerate(_novel_positions(height, width)):
         novel = PointLight(
             torch.tensor([position], device=photo.device), refined.light.intensity, refined.light.falloff
         )
         sheet.picture(
-            3, column, _seen(refined.render(novel)), "novel light", f"at {_numbers(position)}", position
+            last, column, _seen(refined.render(novel)), "novel light", f"at {_numbers(position)}", position
         )
     _draw_losses(sheet.plot(1, 2), refined.losses)
-    sheet.text(3, _facts(refined))
+    sheet.text(last, _facts(refined))
     return sheet.figure
 
 
 class _Sheet:
     """A grid of equal slots, laid out in pixels from the top left."""
 
-    def __init__(self, height: int, width: int) -> None:
+    def __init__(self, height: int, width: int, rows: int) -> None:
         scale = TILE / max(height, width)
         self.tile = max(1, round(height * scale)), max(1, round(width * scale))
         self.surface = width / max(height, width), height / max(height, width)
         self.slot = max(self.tile[1], SMALLEST_SLOT[0]), max(self.tile[0], SMALLEST_SLOT[1])
         self.width = 2 * MARGIN + COLUMNS * self.slot[0] + (COLUMNS - 1) * GAP
-        self.height = 2 * MARGIN + HEADER + ROWS * (self.slot[1] + CAPTION) + (ROWS - 1) * GAP
+        self.height = 2 * MARGIN + HEADER + rows * (self.slot[1] + CAPTION) + (rows - 1) * GAP
         self.figure = Figure(figsize=(self.width / DPI, self.height / DPI), dpi=DPI, facecolor="white")
 
     def corner(self, row: int, column: int) -> tuple[int, int]:

@@ -175,6 +175,25 @@ def test_directx_flips_green_and_exr_is_linear(cli: Callable[..., int], photo: P
     assert "DirectX" in record["maps"]["encodings"]["normal"]
 
 
+def test_uncertainty_is_a_file_for_every_map_and_a_row_of_the_report(
+    cli: Callable[..., int], photo: Path, here: Path
+) -> None:
+    assert cli(photo, "--iters", "4", "--uncertainty", "--out", "doubt") == 0
+    assert cli(photo, "--iters", "4", "--out", "sure") == 0
+    assert set(os.listdir(here / "doubt")) == PNG | {f"wall_{name}_deviation.png" for name in MAPS}
+    encodings = json.loads((here / "doubt" / "wall.json").read_text())["maps"]["encodings"]
+    for name in MAPS:
+        deviation = oiio.ImageBuf(str(here / "doubt" / f"wall_{name}_deviation.png")).get_pixels()
+        assert deviation.shape[2] == 1
+        assert float(deviation.min()) > 0.0
+        assert "standard deviation" in encodings[f"{name}_deviation"]
+        same = (here / folder / f"wall_{name}.png" for folder in ("doubt", "sure"))
+        assert len({path.read_bytes() for path in same}) == 1
+    tall, short = (oiio.ImageBuf(str(here / f / "wall_report.png")).spec() for f in ("doubt", "sure"))
+    assert tall.height > short.height
+    assert tall.width == short.width
+
+
 def test_a_given_light_and_camera_are_kept(cli: Callable[..., int], photo: Path, here: Path) -> None:
     options = ("--light", "0.2,-0.1,2.0", "--falloff", "inverse_square", "--camera", "collocated")
     assert cli(photo, "--iters", "2", "--no-report", *options) == 0
@@ -428,7 +447,7 @@ def test_a_failure_while_writing_leaves_nothing(
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    def interrupted(*_: object) -> None:
+    def interrupted(*_: object, **__: object) -> None:
         raise KeyboardInterrupt
 
     monkeypatch.setattr(refine.result, "write_sheet", interrupted)

@@ -1,4 +1,4 @@
-"""Whatever is fed to refinement: finite legal maps, no exception, and no photo explained worse than before."""
+"""Whatever refinement is fed: finite legal maps, no exception, no photo explained worse than before."""
 
 import math
 from dataclasses import dataclass
