@@ -14,7 +14,7 @@ from __future__ import annotations
 import numpy as np
 import torch
 from jaxtyping import Float, Int
-from scipy.ndimage import gaussian_filter
+from scipy.ndimage import uniform_filter
 from torch.nn.functional import normalize
 
 from nets.color import gamma_encode
@@ -28,8 +28,8 @@ OVERLAPS = (0.1, 0.3)
 SEARCH_SIDE = 512
 """Pixels of a side at which the overlap is chosen."""
 
-COARSE = 0.25
-"""Standard deviation of the blur that tells coarse from fine, as a share of the overlap."""
+COARSE = 0.5
+"""Width of the blur that tells coarse from fine, as a share of the overlap; at most two thirds."""
 
 FEATHER = 2
 """Pixels to either side of the cut over which fine detail is faded."""
@@ -55,7 +55,7 @@ def make_seamless(svbrdf: SVBRDF) -> SVBRDF:
             f"A tile needs {SMALLEST_SIDE} pixels a side, the maps are {width} x {height}; "
             "refine at a higher resolution."
         )
-    stack = svbrdf.channels()[0].movedim(0, -1).double().cpu().numpy()
+    stack = svbrdf.channels()[0].movedim(0, -1).float().cpu().numpy()
     closed = _close(stack, repeats=False)
     closed = _close(closed.swapaxes(0, 1), repeats=True).swapaxes(0, 1)
     channels = torch.from_numpy(np.ascontiguousarray(closed)).movedim(-1, 0)[None].to(svbrdf.normal)
@@ -74,22 +74,30 @@ def _close(stack: Stack, *, repeats: bool) -> Float[np.ndarray, "height narrower
     width = stack.shape[1]
     seen = _as_seen(stack)
     overlap = _best_overlap(seen)
-    mode = ("wrap" if repeats else "nearest", "nearest", "nearest")
-    coarse = gaussian_filter(stack, (overlap * COARSE, overlap * COARSE, 0.0), mode=mode)
-    left, right = slice(0, overlap), slice(width - overlap, width)
+    left, right = stack[:, :overlap], stack[:, width - overlap :]
+    blur = round(overlap * COARSE)
+    coarse_left = _blur(stack[:, : 2 * overlap], blur, repeats=repeats)[:, :overlap]
+    coarse_right = _blur(stack[:, width - 2 * overlap :], blur, repeats=repeats)[:, overlap:]
     across = np.arange(overlap)
     ramp = np.clip((across - FEATHER) / (overlap - 1.0 - 2 * FEATHER), 0.0, 1.0)
     fade = (ramp**2 * (3.0 - 2.0 * ramp))[None, :, None]
-    cut = _cut(_difference(seen[:, left], seen[:, right]), repeats=repeats)
+    cut = _cut(_difference(seen[:, :overlap], seen[:, width - overlap :]), repeats=repeats)
     sharp = np.clip((across[None, :] - cut[:, None]) / (2.0 * FEATHER) + 0.5, 0.0, 1.0)[..., None]
-    fine = stack - coarse
     seam = (
-        fade * coarse[:, left]
-        + (1.0 - fade) * coarse[:, right]
-        + sharp * fine[:, left]
-        + (1.0 - sharp) * fine[:, right]
+        fade * coarse_left
+        + (1.0 - fade) * coarse_right
+        + sharp * (left - coarse_left)
+        + (1.0 - sharp) * (right - coarse_right)
     )
-    return np.concatenate([seam, stack[:, overlap : width - overlap]], axis=1)
+    return np.concatenate([seam.astype(stack.dtype), stack[:, overlap : width - overlap]], axis=1)
+
+
+def _blur(strip: Stack, width: int, *, repeats: bool) -> Stack:
+    """Blur a strip along both sides of the picture: three box filters, which are nearly a Gaussian."""
+    mode = ("wrap" if repeats else "nearest", "nearest", "nearest")
+    for _ in range(3):
+        strip = uniform_filter(strip, (width, width, 1), mode=mode)
+    return strip
 
 
 def _as_seen(stack: Stack) -> Stack:

@@ -84,7 +84,7 @@ def test_a_material_that_repeats_shows_through() -> None:
     material = SVBRDF(flat.normal, wave.expand(1, 3, 100, 100), wave, wave.expand(1, 3, 100, 100))
     tile = make_seamless(material)
     assert tile.size == (80, 80)
-    torch.testing.assert_close(tile.diffuse, material.diffuse[..., :80, :80], atol=0.03, rtol=0.0)
+    torch.testing.assert_close(tile.diffuse, material.diffuse[..., :80, :80], atol=0.04, rtol=0.0)
 
 
 def test_a_cut_takes_the_cheapest_way_and_comes_back() -> None:
