@@ -66,7 +66,8 @@ def test_known_lights_are_kept(kind: str, photos: list[str], checkpoint: Path, t
         source.write_text(json.dumps({"positions": POSITIONS}))
     else:
         source = Path(photos[0]).parent
-        (source / "calib.json").write_text(json.dumps({"camera_pos": POSITIONS, "im_size": 2.0}))
+        width = 0.5  # of which the surface's longer side, 2, is four times as much
+        (source / "calib.json").write_text(json.dumps({"camera_pos": POSITIONS, "im_size": width}))
     out = tmp_path / "out"
     assert run(checkpoint, *photos, "--one-surface", "--lights", str(source), "--out", str(out)) == 0
     record = json.loads((out / "00.json").read_text())
