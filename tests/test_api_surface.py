@@ -22,6 +22,7 @@ PUBLIC = {
     "refine.stages": "GlobalStage PixelStage Rates Recipe RECIPES find_recipe",
     "refine.photo": "Photo photo_from_array read_photo",
     "refine.maps": "MapFormat map_paths read_maps write_maps",
+    "refine.export": "TARGETS export_material",
     "refine.capture": "Capture",
     "nets.checkpoint": "CheckpointError Record load_model read_record save_model",
     "nets.generator": "Generator GeneratorConfig PAPER_GENERATOR NARROW_GENERATOR",
@@ -44,6 +45,7 @@ PARAMETERS = {
     ("refine", "Refiner.fit"): "self img light iters color_space progress",
     ("refine", "Refined.render"): "self light camera",
     ("refine", "Refined.save"): "self folder stem format normal_convention",
+    ("refine.export", "export_material"): "svbrdf folder stem targets format tile",
     ("nets.checkpoint", "load_model"): "name",
     ("nets.render", "render"): "svbrdf light camera conventions",
     ("nets.render", "PointLight.at"): "position intensity falloff dtype",
@@ -61,7 +63,8 @@ SCRIPTS = {"refine", "refine-train", "refine-eval"}
 
 OPTIONS = {
     "refine.cli": "light falloff camera color-space resolution init recipe iters quick seed out format "
-    "normals no-report json quiet device threads version",
+    "normals no-report export json quiet device threads version",
+    "refine.export.cli": "to tile format name out quiet",
     "refine.train": "config data out pairs stage start resume steps vgg accelerator devices nodes threads "
     "seed save-every data-note",
 }
@@ -110,6 +113,11 @@ def test_defaults_that_results_depend_on() -> None:
     assert inspect.signature(importlib.import_module("nets.checkpoint").load_model).parameters[
         "name"
     ].default == ("default")
+
+
+def test_targets_of_exports_are_there() -> None:
+    targets = importlib.import_module("refine.export").TARGETS
+    assert {"materialx", "gltf", "usd", "blender", "orm", "unity", "height", "tile"} <= set(targets)
 
 
 def test_recipes_are_there() -> None:
