@@ -233,6 +233,8 @@ def write_image(
     spec = oiio.ImageSpec(width, height, channels, _STORAGE[format.extension, format.bits])
     spec.channelnames = ("Y",) if channels == 1 else ("R", "G", "B", "A")[:channels]
     spec.attribute("oiio:ColorSpace", color_space)
+    if channels == 4:
+        spec.attribute("oiio:UnassociatedAlpha", 1)  # or the others would be divided by it
     spec.attribute("DateTime", "")  # the time of writing would make every file differ
     spec.attribute("compression", "zip")
     output = oiio.ImageOutput.create(str(temporary))
