@@ -3,19 +3,16 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated, Any
 
 import torch
 import typer
-from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from eval.ablations import ablation_estimator
 from eval.calibration import calibration_markdown, evaluate_calibration, lights_finder, measured_scenes
+from eval.console import INCOMPLETE, mistakes, progress, tell
 from eval.datasets import NOVEL_LIGHTS, SIZE, Protocol, spread
 from eval.development import (
     DEVELOPMENT,
@@ -31,19 +28,10 @@ from eval.real import evaluate_real, real_estimator, real_markdown
 from eval.real_scenes import CAMERA, list_real_scenes
 from eval.report import Results, provenance
 from losses.perceptual import LPIPS
-from nets.checkpoint import CheckpointError
-from nets.data.images import DataError
 from refine.refiner import Refiner
 from refine.stages import RECIPES, find_recipe
 
-BAD_USAGE = 2
-"""Exit code: nothing was done, one sentence says why."""
-
-INCOMPLETE = 3
-"""Exit code: done, but scenes that are named were skipped."""
-
 main = typer.Typer(add_completion=False, no_args_is_help=True, help="Evaluate SVBRDF capture.")
-errors = Console(stderr=True, soft_wrap=True, highlight=False)
 
 Data = Annotated[Path, typer.Option(help="Holds strips/des18_dev, strips/des19_dev and materials/dev.")]
 Checkpoint = Annotated[str, typer.Option(help="Checkpoint: a shipped name or a file.")]
@@ -84,7 +72,7 @@ def development(
 ) -> None:
     """Score a checkpoint's initialization, and its refinement, on the development sets."""
     _use_threads(threads)
-    with _mistakes():
+    with mistakes():
         require(data, DEVELOPMENT)
         chosen = find_recipe("default" if recipe == "none" else recipe)
         refiner = Refiner(init, chosen, resolution=size, flips=flips, seed=seed)
@@ -92,8 +80,8 @@ def development(
     about = provenance()  # of the code that runs, whatever is committed meanwhile
     estimator = refinement_estimator(refiner, 0 if recipe == "none" else iters, estimate_light=estimate_light)
     protocol = Protocol(size=size, lights=lights, seed=seed, stored_input=stored_input)
-    with _progress(count_scenes(data, DEVELOPMENT, scenes)) as tell:
-        results = evaluate(estimator, data, DEVELOPMENT, protocol, scenes, LPIPS(), tell)
+    with progress(count_scenes(data, DEVELOPMENT, scenes)) as advance:
+        results = evaluate(estimator, data, DEVELOPMENT, protocol, scenes, LPIPS(), advance)
     results.settings |= {
         "init": init,
         "recipe": recipe,
@@ -117,14 +105,14 @@ def ablations(
 ) -> None:
     """Score the default recipe with each of its ingredients taken away, on the development sets."""
     _use_threads(threads)
-    with _mistakes():
+    with mistakes():
         require(data, DEVELOPMENT)
         refiner = Refiner(init)
 
     about = provenance()
-    with _progress(count_scenes(data, DEVELOPMENT, scenes)) as tell:
+    with progress(count_scenes(data, DEVELOPMENT, scenes)) as advance:
         protocol = Protocol(lights=lights)
-        results = evaluate(ablation_estimator(refiner), data, DEVELOPMENT, protocol, scenes, LPIPS(), tell)
+        results = evaluate(ablation_estimator(refiner), data, DEVELOPMENT, protocol, scenes, LPIPS(), advance)
     results.settings |= {"init": init, "recipe": "ablations of default", **about}
     _finish(results, markdown(results), json_file, markdown_file)
 
@@ -149,7 +137,7 @@ def real(
     """Score checkpoints on real surfaces in several flash photos of known lights (paper Table 2)."""
     _use_threads(threads)
     inits = init or ["default"]
-    with _mistakes():
+    with mistakes():
         count = len(spread(len(list_real_scenes(folder)), scenes))
         chosen = find_recipe("default" if recipe == "none" else recipe)
         refiners = {
@@ -160,8 +148,8 @@ def real(
     about = provenance()
     total = 0 if recipe == "none" else iters
     estimator = real_estimator(refiners, total, match_exposure=match_exposure)
-    with _progress(count) as tell:
-        results = evaluate_real(estimator, folder, size, scenes, LPIPS(), tell)
+    with progress(count) as advance:
+        results = evaluate_real(estimator, folder, size, scenes, LPIPS(), advance)
     results.settings |= {
         "inits": inits,
         "recipe": recipe,
@@ -190,13 +178,13 @@ def light(
     """Score checkpoints' light heads, alone and after the light fit, on the development sets."""
     _use_threads(threads)
     inits = init or ["default"]
-    with _mistakes():
+    with mistakes():
         require(data, DEVELOPMENT)
         refiners = {name: Refiner(name, recipe, resolution=size, flips=flips, seed=seed) for name in inits}
 
     about = provenance()
-    with _progress(count_scenes(data, DEVELOPMENT, scenes)) as tell:
-        results = evaluate_lights(light_estimator(refiners), data, DEVELOPMENT, size, seed, scenes, tell)
+    with progress(count_scenes(data, DEVELOPMENT, scenes)) as advance:
+        results = evaluate_lights(light_estimator(refiners), data, DEVELOPMENT, size, seed, scenes, advance)
     results.settings |= {"inits": inits, "recipe": recipe, "flips": flips, **about}
     _finish(results, lights_markdown(results), json_file, markdown_file)
 
@@ -216,7 +204,7 @@ def photos(
     """Refine real photos and say whether each is explained, with legal maps."""
     _use_threads(threads)
     found = find_photos(folders)
-    with _mistakes():
+    with mistakes():
         first, step = (int(number) for number in part.split("/"))
         refiner = Refiner(init, recipe)
         if not 1 <= first <= step:
@@ -230,13 +218,13 @@ def photos(
 
     def skip(path: Path, reason: str) -> None:
         skipped.append(path)
-        errors.print(f"refine-eval: skipped {path}: {reason}", markup=False)
+        tell(f"skipped {path}: {reason}")
 
     scores = []
-    with _progress(len(found)) as tell:
+    with progress(len(found)) as advance:
         for score in score_photos(refiner, found, iters, skip):
             scores.append(score)
-            tell(score.name)
+            advance(score.name)
     if scores:
         typer.echo(photos_markdown(scores), nl=False)
     if json_file is not None:
@@ -259,13 +247,13 @@ def calibration(
 ) -> None:
     """Score the self-calibration of several photos' lights where they were measured."""
     _use_threads(threads)
-    with _mistakes():
+    with mistakes():
         scenes = measured_scenes(data / "photos/multi_dev")
         refiner = Refiner(init, resolution=size, flips=flips)
 
     about = provenance()
-    with _progress(len(scenes)) as tell:
-        results = evaluate_calibration(lights_finder(refiner), scenes, tell)
+    with progress(len(scenes)) as advance:
+        results = evaluate_calibration(lights_finder(refiner), scenes, advance)
     results.settings |= {"init": init, "flips": flips, "size": size, **about}
     _finish(results, calibration_markdown(results), json_file, markdown_file)
 
@@ -273,25 +261,6 @@ def calibration(
 def _use_threads(count: int) -> None:
     if count:
         torch.set_num_threads(count)
-
-
-@contextmanager
-def _mistakes() -> Iterator[None]:
-    """Turn what a user can mend into one sentence and an exit code, before anything is computed."""
-    try:
-        yield
-    except (DataError, CheckpointError, ValueError) as error:
-        errors.print(f"refine-eval: {error}", markup=False)
-        raise typer.Exit(BAD_USAGE) from None
-
-
-@contextmanager
-def _progress(total: int) -> Iterator[Callable[[str], None]]:
-    """Show a bar on a terminal; yield what is to be called with the name of everything that is done."""
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-    with Progress(*columns, console=errors, transient=True, disable=not errors.is_terminal) as bar:
-        task = bar.add_task("scenes", total=total)
-        yield lambda name: bar.update(task, advance=1, description=name[-40:])
 
 
 def _finish(results: Results[Any], table: str, json_file: Path | None, markdown_file: Path | None) -> None:
@@ -303,7 +272,7 @@ def _finish(results: Results[Any], table: str, json_file: Path | None, markdown_
         json_file.write_text(json.dumps(results.as_json(), indent=1, sort_keys=True) + "\n", encoding="utf-8")
     if results.skipped:
         for name, reason in results.skipped.items():
-            errors.print(f"refine-eval: skipped {name}: {reason}", markup=False)
+            tell(f"skipped {name}: {reason}")
         raise typer.Exit(INCOMPLETE)
 
 

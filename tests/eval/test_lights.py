@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 from typer.testing import CliRunner
 
-from eval import cli
+from eval import cli, console
 from eval.lights import (
     BANDS,
     LightResults,
@@ -148,5 +148,5 @@ def test_the_command_prints_and_writes_the_table(
 
 def test_missing_data_is_one_sentence_and_exit_2(tmp_path: Path, no_network: None) -> None:
     result = CliRunner().invoke(cli.main, ["light", "--data", str(tmp_path)])
-    assert result.exit_code == cli.BAD_USAGE
+    assert result.exit_code == console.BAD_USAGE
     assert result.stderr.strip().endswith("strips/des18_dev is not a folder")

@@ -9,7 +9,8 @@ import pytest
 import torch
 from typer.testing import CliRunner
 
-from eval.cli import BAD_USAGE, INCOMPLETE, main
+from eval.cli import main
+from eval.console import BAD_USAGE, INCOMPLETE
 from eval.photos import PhotoScore, find_photos, photos_markdown, score_photos
 from nets.render import PointLight
 from nets.svbrdf import SVBRDF

@@ -10,7 +10,7 @@ import pytest
 import torch
 from typer.testing import CliRunner
 
-from eval import cli
+from eval import cli, console
 from eval.development import Estimate
 from eval.real import (
     RealResults,
@@ -236,7 +236,7 @@ def test_the_command_compares_checkpoints(tmp_path: Path, surface: SVBRDF, no_ne
 def test_mistakes_are_one_sentence_and_exit_2(tmp_path: Path, no_network: None) -> None:
     for arguments in ([str(tmp_path / "nowhere")], [str(tmp_path)], [str(tmp_path), "--recipe", "soup"]):
         result = run(*arguments)
-        assert result.exit_code == cli.BAD_USAGE
+        assert result.exit_code == console.BAD_USAGE
         assert result.stderr.count("\n") == 1
         assert result.stdout == ""
 
@@ -247,6 +247,6 @@ def test_a_scene_without_lights_is_named_and_exit_3(
     write_surface(tmp_path / "wall", surface, "calib.json")
     (write_surface(tmp_path / "floor", surface, "calib.json") / "calib.json").unlink()
     result = run(str(tmp_path))
-    assert result.exit_code == cli.INCOMPLETE
+    assert result.exit_code == console.INCOMPLETE
     assert "skipped floor" in result.stderr
     assert "- floor: " in result.stdout
