@@ -25,7 +25,7 @@ from eval.development import (
 from eval.lights import evaluate_lights, light_estimator, lights_markdown
 from eval.photos import find_photos, photos_markdown, score_photos
 from eval.real import evaluate_real, real_estimator, real_markdown
-from eval.real_scenes import CAMERA, list_real_scenes
+from eval.real_scenes import CAMERA, list_real_scenes, read_scene_lights
 from eval.report import Results, provenance
 from losses.perceptual import LPIPS
 from refine.refiner import Refiner
@@ -126,6 +126,9 @@ def real(
     scenes: Scenes = None,
     size: Size = SIZE,
     seed: Annotated[int, typer.Option(min=0, help="Of refinement.")] = 0,
+    lights: Annotated[
+        Path | None, typer.Option(help="Lights of the scenes, of python -m eval.scene_lights.")
+    ] = None,
     match_exposure: Annotated[
         bool, typer.Option(help="Refine under a light as bright as the initialization needs it, not 1.")
     ] = False,
@@ -139,6 +142,7 @@ def real(
     inits = init or ["default"]
     with mistakes():
         count = len(spread(len(list_real_scenes(folder)), scenes))
+        known = None if lights is None else read_scene_lights(lights)
         chosen = find_recipe("default" if recipe == "none" else recipe)
         refiners = {
             name: Refiner(name, chosen, camera=CAMERA, resolution=size, flips=flips, seed=seed)
@@ -149,12 +153,13 @@ def real(
     total = 0 if recipe == "none" else iters
     estimator = real_estimator(refiners, total, match_exposure=match_exposure)
     with progress(count) as advance:
-        results = evaluate_real(estimator, folder, size, scenes, LPIPS(), advance)
+        results = evaluate_real(estimator, folder, size, scenes, LPIPS(), advance, known)
     results.settings |= {
         "inits": inits,
         "recipe": recipe,
         "iters": iters,
         "match_exposure": match_exposure,
+        "lights": None if lights is None else lights.name,
         "flips": flips,
         "seed": seed,
         **about,

@@ -16,7 +16,7 @@ import torch
 
 from eval.development import Estimate
 from eval.metrics import rendering_lpips, rendering_rmse
-from eval.real_scenes import CAMERA, RELIABLE, Lights, RealScene, read_real_scenes
+from eval.real_scenes import CAMERA, RELIABLE, Lights, RealScene, SceneLights, read_real_scenes
 from eval.report import Results, markdown_table, number, origin, skipped_lines
 from losses.perceptual import LPIPS
 from nets.color import luminance
@@ -161,6 +161,7 @@ def evaluate_real(
     scenes: int | None = None,
     lpips: LPIPS | None = None,
     progress: Callable[[str], None] | None = None,
+    lights: Mapping[str, SceneLights] | None = None,
 ) -> RealResults:
     """Run methods over the scenes of a folder and score every estimate.
 
@@ -171,12 +172,13 @@ def evaluate_real(
         scenes: so many, evenly spread; all by default.
         lpips: the network; without it that column is NaN.
         progress: called with each scene's name once it is done.
+        lights: of scenes by name, in place of what their folders say.
 
     Raises:
         DataError: the folder is missing or empty. Unusable scenes are recorded and skipped.
     """
     results = RealResults(settings={"folder": folder.resolve().name, "size": size})
-    for scene in read_real_scenes(folder, size, scenes, results.skipped):
+    for scene in read_real_scenes(folder, size, scenes, results.skipped, lights):
         x, y, z = scene.light.position[0].tolist()
         angle = math.degrees(math.atan2(math.hypot(x, y), z))
         given = Path(scene.photo.source).name
@@ -200,10 +202,16 @@ def caption(settings: Mapping[str, Any]) -> str:
         f"photos of a scene, encoded with 1/2.2) and LPIPS v0.1 AlexNet, averaged over scenes. Given is "
         f"the photo whose light is most central, and that light, {brightness}. Camera at the flash, "
         f"inverse-square falloff; one exposure per estimate, the median ratio of the given photo to its "
-        f"rendering. Lights are uncertain where their calibration does not call itself {RELIABLE}. "
+        f"rendering. {_lights_caption(settings.get('lights'))} "
         f"Checkpoints {', '.join(settings.get('inits', '?'))}{flips}; seed {settings.get('seed', '?')}; "
         f"{origin(settings)}."
     )
+
+
+def _lights_caption(file: str | None) -> str:
+    if file is None:
+        return f"Lights are uncertain where their calibration does not call itself {RELIABLE}."
+    return f"Lights and every photo's exposure are those of {file}, uncertain where it does not believe them."
 
 
 def real_markdown(results: RealResults) -> str:
