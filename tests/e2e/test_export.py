@@ -13,7 +13,6 @@ import pytest
 import refine.cli
 from nets.svbrdf import MAPS
 from refine.maps import map_paths, read_maps
-from tests.e2e.pictures import flash_photo, save_picture
 from tests.helpers import assert_close
 
 LIGHT = "blender,orm,height"
@@ -81,21 +80,18 @@ def test_refine_exports_what_it_wrote(checkpoint: Path, photo: Path, tmp_path: P
     assert map_paths(tmp_path / "wall", "wall")["normal"].exists()
 
 
-def test_a_photo_called_export(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, checkpoint: Path) -> None:
+def test_a_photo_called_export(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
     """The command wins, and says so; with a path in front it is a photo."""
     monkeypatch.chdir(tmp_path)
-    save_picture(tmp_path / "export.png", flash_photo(24, 24)).rename(tmp_path / "export")
-    options = ("--init", str(checkpoint), "--iters", "0", "--no-report", "-q", "--out", "made")
-    assert refine.cli.run(["./export", *options]) == 0
-    assert "export_normal.png" in listing(tmp_path / "made")
-    done = subprocess.run(
-        [sys.executable, "-m", "refine.cli", "export", "nowhere", "--to", "orm"],
-        capture_output=True,
-        text=True,
-        timeout=60,
-    )
-    assert done.returncode == 2
-    assert "for the photo of that name say refine ./export" in done.stderr
+    (tmp_path / "export").touch()
+    assert run("nowhere", "--to", "orm") == 2
+    told, error = capfd.readouterr().err.splitlines()
+    assert "for the photo of that name say refine ./export" in told
+    assert "nowhere is not a folder" in error
+    assert refine.cli.run(["./export"]) == 2
+    assert "export is empty" in capfd.readouterr().err
 
 
 def no_result(folder: Path) -> None:
