@@ -9,9 +9,11 @@ import numpy as np
 import torch
 
 from eval.development import STRIPS
+from nets.checkpoint import Record, save_model
 from nets.color import linear_to_srgb
 from nets.data.images import write_image
 from nets.data.strips import write_strip
+from nets.generator import Generator, GeneratorConfig
 from nets.render import Camera, PointLight, render, surface_points
 from nets.svbrdf import SVBRDF
 
@@ -26,6 +28,14 @@ class FakeModel:
 
     def predict(self, photo: torch.Tensor) -> tuple[SVBRDF, PointLight]:
         return grey(photo), PointLight.at((0.0, 0.0, 2.0))
+
+
+def write_checkpoint(path: Path, seed: int = 0) -> Path:
+    """Write a tiny network that was never trained."""
+    torch.manual_seed(seed)
+    config = GeneratorConfig(width=2, levels=3, deep_multiplier=2)
+    save_model(path, Generator(config), Record(config))
+    return path
 
 
 def material(seed: int, size: int = 80) -> SVBRDF:

@@ -1,0 +1,193 @@
+"""The rows of the paper's tables: which weights, which recipe, and the figures the paper prints for them.
+
+Adding a row is adding an entry to `METHODS`. Weights are looked for among the shipped checkpoints by name; a
+row whose weights are not there stays in the tables as a visible gap.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+from nets.checkpoint import CheckpointError, load_model, resolve
+from nets.ensemble import FlipAverage, Predictor
+from nets.render import Camera
+from refine.refiner import Refiner
+from refine.stages import find_recipe
+
+
+@dataclass(frozen=True)
+class Method:
+    """One row.
+
+    Attributes:
+        name: of the row, as the paper writes it.
+        checkpoint: name of the shipped weights, or a file.
+        recipe: of refinement; None is the network's answer as it is.
+        table1: the paper's figures by name of the score, as far as it prints them.
+        table2: likewise.
+        load: from the checkpoint's name or file to the network.
+    """
+
+    name: str
+    checkpoint: str
+    recipe: str | None = None
+    table1: Mapping[str, float] = field(default_factory=dict)
+    table2: Mapping[str, float] = field(default_factory=dict)
+    load: Callable[[Path], Predictor] = load_model
+
+
+@dataclass(frozen=True)
+class Row:
+    """A method whose weights are there.
+
+    Attributes:
+        method: the row.
+        weights: its file.
+        digest: sha256 of the file, the first 16 digits.
+    """
+
+    method: Method
+    weights: Path
+    digest: str
+
+    def refiner(self, camera: Camera, size: int, seed: int, *, flips: bool) -> Refiner:
+        """Load the weights; the recipe is the paper's where the row has none, and is not run there."""
+        network = self.method.load(self.weights)
+        model = FlipAverage(network) if flips else network
+        recipe = self.method.recipe or "paper"
+        return Refiner(model, recipe, camera=camera, resolution=size, seed=seed)
+
+    def settings(self) -> dict[str, Any]:
+        """Return what the row's answers depend on: digests of weights and recipe."""
+        recipe = None
+        if self.method.recipe is not None:
+            numbers = json.dumps(asdict(find_recipe(self.method.recipe)), sort_keys=True)
+            recipe = f"{self.method.recipe} {hashlib.sha256(numbers.encode()).hexdigest()[:16]}"
+        return {"row": self.method.name, "checkpoint": self.digest, "recipe": recipe}
+
+
+def _table1(*figures: float) -> dict[str, float]:
+    return dict(
+        zip(("normal", "diffuse", "roughness", "specular", "rendering", "lpips"), figures, strict=True)
+    )
+
+
+def _table2(lpips: float, rendering: float) -> dict[str, float]:
+    return {"lpips": lpips, "rendering": rendering}
+
+
+_ROWS = (
+    Method(
+        "Des18",
+        "des18",
+        table1=_table1(0.065, 0.058, 0.175, 0.129, 0.086, 0.278),
+        table2=_table2(0.349, 0.131),
+    ),
+    Method(
+        "Des19",
+        "des19",
+        table1=_table1(0.092, 0.062, 0.129, 0.066, 0.100, 0.223),
+        table2=_table2(0.335, 0.168),
+    ),
+    Method(
+        "Gao19",
+        "gao19",
+        table1=_table1(0.068, 0.065, 0.123, 0.065, 0.072, 0.274),
+        table2=_table2(0.419, 0.132),
+    ),
+    Method(
+        "Ours_syn",
+        "syn",
+        table1=_table1(0.054, 0.062, 0.100, 0.065, 0.078, 0.193),
+        table2=_table2(0.306, 0.148),
+    ),
+    Method(
+        "Ours_hyb",
+        "hyb",
+        table1=_table1(0.056, 0.062, 0.104, 0.066, 0.074, 0.187),
+        table2=_table2(0.279, 0.138),
+    ),
+    Method(
+        "Gao19+",
+        "gao19",
+        "paper",
+        table1=_table1(0.069, 0.065, 0.123, 0.070, 0.068, 0.177),
+        table2=_table2(0.307, 0.133),
+    ),
+    Method(
+        "Ours_syn+",
+        "syn",
+        "paper",
+        table1=_table1(0.053, 0.063, 0.115, 0.079, 0.058, 0.153),
+        table2=_table2(0.275, 0.121),
+    ),
+    Method(
+        "Ours_hyb+",
+        "hyb",
+        "paper",
+        table1=_table1(0.054, 0.063, 0.124, 0.090, 0.059, 0.155),
+        table2=_table2(0.256, 0.119),
+    ),
+    # Sec. 6.2 prints LPIPS and RMSE of renderings only.
+    Method("Ours_l1", "l1", table1={"rendering": 0.073, "lpips": 0.236}),
+    Method("Ours_no_render", "no_render"),
+    Method("Ours_hyb default", "hyb", "default"),
+)
+
+METHODS: dict[str, Method] = {method.name: method for method in _ROWS}
+"""Rows by name, in the paper's order: Tables 1 and 2, the ablations of Sec. 6.2, then what `refine` does."""
+
+
+def choose(names: Sequence[str] | None) -> list[Method]:
+    """Return rows by name, in the order of the table; all if None.
+
+    Raises:
+        ValueError: naming one that does not exist, and the known ones.
+    """
+    for name in names or ():
+        if name not in METHODS:
+            raise ValueError(f"no row is called {name!r}; the known ones are {', '.join(METHODS)}")
+    return [method for name, method in METHODS.items() if names is None or name in names]
+
+
+def parse_inits(inits: Sequence[str]) -> dict[str, str]:
+    """Return checkpoints by row from `ROW=CHECKPOINT`.
+
+    Raises:
+        ValueError: naming what is not of that form, or a row that does not exist.
+    """
+    found = {}
+    for text in inits:
+        name, sign, checkpoint = text.partition("=")
+        if not sign or not checkpoint:
+            raise ValueError(f"--init {text} is not ROW=CHECKPOINT, for example Ours_syn=syn.safetensors")
+        choose([name])
+        found[name] = checkpoint
+    return found
+
+
+def find_weights(
+    methods: Sequence[Method], inits: Mapping[str, str] | None = None
+) -> tuple[list[Row], dict[str, str]]:
+    """Return the rows whose weights can be loaded, and the reason for every other, by name.
+
+    Args:
+        methods: in the order of the table.
+        inits: checkpoints by row, in place of the registry's.
+    """
+    rows, gaps = [], {}
+    for method in methods:
+        checkpoint = (inits or {}).get(method.name, method.checkpoint)
+        try:
+            weights = resolve(checkpoint)
+            method.load(weights)
+        except CheckpointError as error:
+            gaps[method.name] = f"no weights: {error}"
+            continue
+        rows.append(Row(method, weights, hashlib.sha256(weights.read_bytes()).hexdigest()[:16]))
+    return rows, gaps

@@ -1,0 +1,78 @@
+"""The registry of rows: whose figures, whose weights, and what is missing."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import pytest
+import torch
+
+from eval.datasets import CAMERA
+from eval.methods import METHODS, choose, find_weights, parse_inits
+from nets.ensemble import FlipAverage
+from tests.eval_files import write_checkpoint
+
+
+def test_rows_are_those_of_the_paper_in_its_order() -> None:
+    table = ["Des18", "Des19", "Gao19", "Ours_syn", "Ours_hyb", "Gao19+", "Ours_syn+", "Ours_hyb+"]
+    assert list(METHODS) == [*table, "Ours_l1", "Ours_no_render", "Ours_hyb default"]
+    assert all(len(METHODS[name].table1) == 6 and len(METHODS[name].table2) == 2 for name in table)
+    assert {name for name in METHODS if METHODS[name].recipe == "paper"} == {n for n in METHODS if "+" in n}
+    assert METHODS["Ours_hyb default"].recipe == "default"
+
+
+def test_figures_of_the_paper() -> None:
+    # The columns of Table 1 added up from the printed page, not from the code.
+    sums = {"normal": 0.511, "diffuse": 0.5, "roughness": 0.993, "specular": 0.63, "rendering": 0.595}
+    rows = list(METHODS.values())[:8]
+    for score, total in {**sums, "lpips": 1.64}.items():
+        assert sum(row.table1[score] for row in rows) == pytest.approx(total, abs=1e-9)
+    assert sum(row.table2["lpips"] for row in rows) == pytest.approx(2.526, abs=1e-9)
+    assert sum(row.table2["rendering"] for row in rows) == pytest.approx(1.09, abs=1e-9)
+    assert METHODS["Ours_hyb+"].table2 == {"lpips": 0.256, "rendering": 0.119}
+    assert METHODS["Ours_l1"].table1 == {"rendering": 0.073, "lpips": 0.236}
+
+
+def test_rows_are_chosen_by_name_in_the_order_of_the_table() -> None:
+    assert [method.name for method in choose(["Ours_l1", "Des18"])] == ["Des18", "Ours_l1"]
+    assert [method.name for method in choose(None)] == list(METHODS)
+    with pytest.raises(ValueError, match=r"no row is called 'Ours'; .*Ours_syn"):
+        choose(["Ours"])
+
+
+def test_inits() -> None:
+    assert parse_inits(["Ours_syn=a=b.pth", "Gao19+=x"]) == {"Ours_syn": "a=b.pth", "Gao19+": "x"}
+    for text in ("Ours_syn", "Ours_syn=", "Nobody=x"):
+        with pytest.raises(ValueError, match=re.escape(text.partition("=")[0])):
+            parse_inits([text])
+
+
+def test_weights_are_found_or_missed_by_name(tmp_path: Path) -> None:
+    tiny = write_checkpoint(tmp_path / "tiny.safetensors")
+    damaged = tmp_path / "damaged.safetensors"
+    damaged.write_bytes(b"none")
+    inits = {"Ours_syn": str(tiny), "Ours_syn+": str(tiny), "Ours_hyb": str(damaged), "Des18": "nowhere"}
+    rows, gaps = find_weights(choose(list(inits)), inits)
+    assert [row.method.name for row in rows] == ["Ours_syn", "Ours_syn+"]
+    assert set(gaps) == {"Ours_hyb", "Des18"}
+    assert "damaged.safetensors" in gaps["Ours_hyb"]
+    assert "nowhere" in gaps["Des18"]
+
+    plain, refined = (row.settings() for row in rows)
+    assert plain["checkpoint"] == refined["checkpoint"]
+    assert plain["recipe"] is None
+    assert refined["recipe"].startswith("paper ")
+    other = write_checkpoint(tmp_path / "tiny.safetensors", seed=1)
+    (changed,), _ = find_weights(choose(["Ours_syn"]), {"Ours_syn": str(other)})
+    assert changed.settings()["checkpoint"] != plain["checkpoint"]
+
+
+def test_a_row_makes_its_refiner(tmp_path: Path) -> None:
+    tiny = str(write_checkpoint(tmp_path / "tiny.safetensors"))
+    (row,), _ = find_weights(choose(["Ours_hyb default"]), {"Ours_hyb default": tiny})
+    refiner = row.refiner(CAMERA, 64, 3, flips=True)
+    assert isinstance(refiner.model, FlipAverage)
+    assert (refiner.recipe.name, refiner.resolution, refiner.seed) == ("default", 64, 3)
+    assert not isinstance(row.refiner(CAMERA, 64, 3, flips=False).model, FlipAverage)
+    assert refiner.fit(torch.rand(3, 64, 64), iters=0).svbrdf.size == (64, 64)
