@@ -140,6 +140,40 @@ def list_scenes(folder: Path, kind: Literal["strips", "pbr"]) -> list[Path]:
     return found
 
 
+def read_scene(path: Path, kind: Literal["strips", "pbr"], index: int, protocol: Protocol) -> Scene:
+    """Read one entry of a test set, as `list_scenes` lists them, as the scene of that index.
+
+    Raises:
+        DataError: it cannot be read.
+    """
+    if kind == "pbr":
+        return make_scene(path.name, read_pbr_folder(path), index, protocol)
+    strip = read_strip(path)
+    return make_scene(path.stem, strip.svbrdf, index, protocol, strip.input)
+
+
+def make_scene(
+    name: str, svbrdf: SVBRDF, index: int, protocol: Protocol, stored: Tensor | None = None
+) -> Scene:
+    """Make a scene of a material: cut square, resized, photographed, with the lights of its index.
+
+    Args:
+        name: of the scene.
+        svbrdf: a batch of one, of any size.
+        index: in its test set.
+        protocol: size, lights and input.
+        stored: a photo `[1, 3, h, w]`, linear, which the protocol may prefer to a rendering.
+    """
+    resized = svbrdf.map(lambda tensor: to_square(tensor, protocol.size))
+    truth = SVBRDF(unit_normal(resized.normal), resized.diffuse, resized.roughness, resized.specular)
+    light: PointLight | None
+    if protocol.stored_input and stored is not None:
+        photo, light = to_square(stored, protocol.size), None
+    else:
+        photo, light = input_photo(truth)
+    return Scene(name, truth, photo, light, novel_lights(index, protocol.lights, protocol.seed))
+
+
 def input_photo(
     truth: SVBRDF, position: tuple[float, float, float] = INPUT_LIGHT
 ) -> tuple[Float[Tensor, "1 3 h w"], PointLight]:
@@ -162,28 +196,10 @@ def _scenes(
     paths = list_scenes(folder, kind)
     for index in spread(len(paths), count):
         try:
-            scene = _read(paths[index], kind, index, protocol)
+            scene = read_scene(paths[index], kind, index, protocol)
         except DataError as error:
             if skip is None:
                 raise
             skip(paths[index].stem, error)
             continue
         yield scene
-
-
-def _read(path: Path, kind: Literal["strips", "pbr"], index: int, protocol: Protocol) -> Scene:
-    stored = None
-    if kind == "strips":
-        strip = read_strip(path)
-        svbrdf, stored = strip.svbrdf, strip.input
-    else:
-        svbrdf = read_pbr_folder(path)
-    resized = svbrdf.map(lambda tensor: to_square(tensor, protocol.size))
-    truth = SVBRDF(unit_normal(resized.normal), resized.diffuse, resized.roughness, resized.specular)
-    light: PointLight | None
-    if protocol.stored_input and stored is not None:
-        photo, light = to_square(stored, protocol.size), None
-    else:
-        photo, light = input_photo(truth)
-    lights = novel_lights(index, protocol.lights, protocol.seed)
-    return Scene(path.stem if kind == "strips" else path.name, truth, photo, light, lights)
