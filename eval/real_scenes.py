@@ -33,7 +33,7 @@ RELIABLE = "ok"
 Lights = Literal["measured", "estimated", "uncertain"]
 """How well the flash's positions are known."""
 
-LARGEST_RESIDUAL = 0.06
+LARGEST_RESIDUAL = 0.05
 """RMSE, encoded with 1/2.2, by which one material may miss all photos if their lights are believed."""
 
 

@@ -111,7 +111,7 @@ def scene_lights_markdown(
     caption = (
         f"Lights of the scenes of {about['folder']}: measured positions are kept, others found from the "
         f"photos; exposures are fitted. Residual: RMSE, encoded with 1/2.2, of one material refined from all "
-        f"photos of a scene (checkpoint {about['init']}, recipe `default`, {about['size']} px); believed "
+        f"photos of a scene (checkpoint {about['init']}, recipe `several`, {about['size']} px); believed "
         f"up to {LARGEST_RESIDUAL:g}; {origin(about)}."
     )
     missing = [f"- {name}: {reason}" for name, reason in skipped.items()]

@@ -234,6 +234,8 @@ class Refiner:
     ) -> Refined:
         """Recover the material of one surface from several photos under different lights.
 
+        The recipe `default`, made for one photo, gives way to `several`.
+
         Args:
             imgs: two or more, each as `fit` takes it.
             lights: where the flash was, one per photo as a batch, if known; only each photo's exposure is
@@ -258,7 +260,8 @@ class Refiner:
         if lights is not None and len(lights.position) != len(imgs):
             raise ValueError(f"{len(lights.position)} lights are given for {len(imgs)} photos")
         torch.manual_seed(self.seed)
-        recipe = self.recipe if iters is None else self.recipe.with_iterations(iters)
+        recipe = find_recipe("several") if self.recipe == find_recipe(DEFAULT_RECIPE) else self.recipe
+        recipe = recipe if iters is None else recipe.with_iterations(iters)
         photos = [self._resized(_photo(img, color_space)) for img in imgs]
         seconds: dict[str, float] = {}
 

@@ -176,13 +176,19 @@ LONG_GLOBAL = GlobalStage(160, Rates(diffuse=0.02, specular=0.02))
 """Of the `default` recipe: the diffuse takes part, or its error would be left to the specular. Roughness does
 not: one photo tells it from specular badly, and as a whole it moves away from the truth as often as not."""
 
+MANY_PHOTOS = PosteriorStage(20, Widths(normal=0.14, diffuse=0.2, roughness=0.17, specular=0.14))
+"""Of the recipe `several`: more photos do tell roughness, so its prior is as wide as errors were measured,
+and the way down is longer."""
+
 RECIPES: dict[str, Recipe] = {
     "default": Recipe("default", stages=(LONG_GLOBAL, PosteriorStage())),
     "paper": Recipe("paper", stages=(GlobalStage(), PixelStage())),
+    "several": Recipe("several", stages=(LONG_GLOBAL, MANY_PHOTOS)),
     "fast": Recipe("fast", light_fit=None, stages=(PosteriorStage(iterations=3),)),
 }
-"""By name. `default` is the best there is. `paper` is Ours+ of Table 1: global roughness and specular, then
-every map per pixel. `fast` believes the light head and takes three steps: real time."""
+"""By name. `default` is the best there is for one photo, and `several` takes its place for more. `paper` is
+Ours+ of Table 1: global roughness and specular, then every map per pixel. `fast` believes the light head and
+takes three steps: real time."""
 
 
 def find_recipe(name: str) -> Recipe:
