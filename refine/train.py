@@ -18,6 +18,7 @@ from nets.data.images import DataError
 from nets.data.materials import Materials, open_materials
 from nets.data.pairs import PhotoPairs
 from nets.data.photography import FlashPhotography
+from nets.data.pool import Part
 from nets.generator import Generator
 from nets.trainer import Trainer
 from nets.training import BatchSource, TrainingBatch
@@ -27,6 +28,8 @@ from refine.training_watch import Watch
 
 STATE = "state.pt"
 """In a stage's folder: all that is needed to go on."""
+
+PARTS: tuple[Part, ...] = ("train", "validation")
 
 LOG_EVERY = 50
 """Iterations between lines of the log and TensorBoard's scalars."""
@@ -107,8 +110,9 @@ def train(
         _check_shards(stages, process_count(devices, nodes))
         origins = {one.name: _origin(one, plan, stages, out, start) for one in stages}
         _check_folders(stages, out, resume)
-        materials = {part: open_materials(data, part, plan.shares) for part in ("train", "validation")}
+        materials = {part: open_materials(data, part, plan.shares) for part in PARTS}
         photos = _open_pairs(pairs, stages)
+        pairs_of = dict(zip(PARTS, photos.parts() if photos else (None, None), strict=True))
         weights = load_vgg16(vgg) if any(needs_vgg(one.objective) for one in stages) else {}
         team = FabricTeam(accelerator=accelerator, devices=devices, nodes=nodes, precision=plan.precision)
         torch.set_num_threads(threads)  # after the launch, which has ideas of its own
@@ -122,9 +126,14 @@ def train(
             objective = give_vgg(one.objective, weights)
             training, validation = (
                 batch_source(
-                    materials[part], plan.augmentation, plan.photography, photos, one.pairs, team.device
+                    materials[part],
+                    plan.augmentation,
+                    plan.photography,
+                    pairs_of[part],
+                    one.pairs,
+                    team.device,
                 )
-                for part in ("train", "validation")
+                for part in PARTS
             )
             trainer = Trainer(
                 Generator(plan.generator),

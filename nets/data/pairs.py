@@ -9,6 +9,7 @@ No light positions are needed: the network estimates the one of b. Those who hav
 
 from __future__ import annotations
 
+import copy
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -22,6 +23,9 @@ from nets.data.photos import PHOTO_SUFFIXES
 
 SCALE = (0.6, 1.0)
 """Side of a square crop as a share of the photo's shorter side, drawn uniformly; the first end is open."""
+
+HELD_OUT_OF = 8
+"""One scene of so many is not trained on."""
 
 _LINEAR = srgb_to_linear((torch.arange(256) / 255.0).expand(3, 1, 256))[0, 0].contiguous()
 """Linear light by 8-bit sRGB code: half of a batch's time would otherwise go into powers."""
@@ -106,6 +110,25 @@ class PhotoPairs:
     def __len__(self) -> int:
         """Return the number of scenes."""
         return len(self.scenes)
+
+    def parts(self) -> tuple[PhotoPairs, PhotoPairs]:
+        """Return the scenes to train on, and those kept to see how a critic does on scenes it does not know.
+
+        One scene in `HELD_OUT_OF` is kept, spread over the folder; of fewer than half as many scenes none can
+        be spared, and both parts are the whole.
+        """
+        count = len(self.scenes)
+        first = HELD_OUT_OF // 2
+        kept = list(range(first - 1, count, HELD_OUT_OF))
+        if not kept:
+            return self, self
+        return self._some([index for index in range(count) if index not in kept]), self._some(kept)
+
+    def _some(self, indices: list[int]) -> PhotoPairs:
+        some = copy.copy(self)
+        some._photos = [self._photos[index] for index in indices]
+        some.scenes = tuple(self.scenes[index] for index in indices)
+        return some
 
     def sample(self, batch: int, crop: int, generator: torch.Generator) -> PairBatch:
         """Draw pairs: of a random scene two different photos in random order, both seen the same way.

@@ -160,3 +160,25 @@ def test_crops_that_were_not_checked_are_refused(folder: Path) -> None:
         pairs.sample(1, 33, seeded(0))
     with pytest.raises(ValueError, match="from 1 to 64 pixels, got 65"):
         PhotoPairs(folder, size=64, crop=65)
+
+
+@pytest.mark.parametrize(
+    ("count", "kept"), [(3, []), (4, [3]), (11, [3]), (13, [3, 11])], ids=lambda value: str(value)
+)
+def test_some_scenes_are_kept_from_training_where_there_are_many(
+    tmp_path: Path, count: int, kept: list[int]
+) -> None:
+    for number in range(count):
+        for photo in range(2):
+            write_photo(tmp_path / f"scene{number:02}" / f"{photo}.png", 8, 8, 10 * number)
+    pairs = PhotoPairs(tmp_path, crop=8)
+    train, validation = pairs.parts()
+    names = [f"scene{number:02}" for number in range(count)]
+    if not kept:
+        assert train is validation is pairs
+        return
+    assert validation.scenes == tuple(names[number] for number in kept)
+    assert train.scenes == tuple(name for name in names if name not in validation.scenes)
+    for part in (train, validation):
+        blues = encode_photo(part.sample(60, 8, seeded(0)).a)[:, 2, 0, 0].tolist()
+        assert {f"scene{blue // 10:02}" for blue in blues} == set(part.scenes)
