@@ -35,13 +35,13 @@ class Results(Generic[Scored]):
 
     def as_json(self) -> dict[str, Any]:
         """Return settings, table rows, every score and the skipped scenes as plain data; NaN is None."""
-        plain = {
+        content = {
             "settings": self.settings,
             "rows": self.rows(),
             "scenes": [asdict(entry) for entry in self.scored],  # type: ignore[call-overload]
             "skipped": self.skipped,
         }
-        return {key: _without_nan(value) for key, value in plain.items()}
+        return {key: plain(value) for key, value in content.items()}
 
 
 def provenance() -> dict[str, str]:
@@ -81,10 +81,10 @@ def skipped_lines(skipped: Mapping[str, str]) -> list[str]:
     return ["", "Skipped:", "", *(f"- {name}: {reason}" for name, reason in skipped.items())]
 
 
-def _without_nan(value: Any) -> Any:
-    # JSON has no NaN.
+def plain(value: Any) -> Any:
+    """Return plain data with None in place of NaN, which JSON has not."""
     if isinstance(value, dict):
-        return {key: _without_nan(item) for key, item in value.items()}
+        return {key: plain(item) for key, item in value.items()}
     if isinstance(value, list):
-        return [_without_nan(item) for item in value]
+        return [plain(item) for item in value]
     return None if isinstance(value, float) and math.isnan(value) else value
