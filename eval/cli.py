@@ -27,11 +27,14 @@ from eval.photos import find_photos, photos_markdown, score_photos
 from eval.real import evaluate_real, real_estimator, real_markdown
 from eval.real_scenes import CAMERA, list_real_scenes, read_scene_lights
 from eval.report import Results, provenance
+from eval.tables_cli import table1, table2
 from losses.perceptual import LPIPS
 from refine.refiner import Refiner
 from refine.stages import RECIPES, find_recipe
 
 main = typer.Typer(add_completion=False, no_args_is_help=True, help="Evaluate SVBRDF capture.")
+main.command()(table1)
+main.command()(table2)
 
 Data = Annotated[Path, typer.Option(help="Holds strips/des18_dev, strips/des19_dev and materials/dev.")]
 Checkpoint = Annotated[str, typer.Option(help="Checkpoint: a shipped name or a file.")]
