@@ -113,6 +113,9 @@ class _ProbeError(Exception):
 def write_result(refined: Refined, output: Output, record: dict[str, Any]) -> dict[str, Path]:
     """Write every file of a result, or none if anything goes wrong or is interrupted.
 
+    Files that an earlier run of the same name left and this one does not replace (maps in another format, a
+    report) are removed at the end, so that the folder never holds maps of two runs.
+
     Args:
         refined: the result.
         output: where and how.
@@ -125,6 +128,7 @@ def write_result(refined: Refined, output: Output, record: dict[str, Any]) -> di
         UserError: a file cannot be written.
     """
     paths = output.paths()
+    outdated = _files_of_record(paths["json"]) - {path.name for path in paths.values()}
     with write_together(list(paths.values())) as siblings:
         temporaries = dict(zip(paths, siblings, strict=True))
         with tempfile.TemporaryDirectory(prefix=".refine-", dir=siblings[0].parent) as staging:
@@ -151,7 +155,23 @@ def write_result(refined: Refined, output: Output, record: dict[str, Any]) -> di
         temporaries["json"].write_text(to_json(record), encoding="utf-8", newline="\n")
         if output.report:
             write_sheet(temporaries["report"], refined, uncertainty=output.uncertainty)
+    for name in outdated:
+        (output.folder / name).unlink(missing_ok=True)
     return paths
+
+
+def _files_of_record(path: Path) -> set[str]:
+    """Return the names of the files that an earlier run wrote, as far as they can only be its own."""
+    try:
+        record = json.loads(path.read_text(encoding="utf-8"))
+        names = record["maps"]["files"].values() if record["format"] == FORMAT else ()
+    except (OSError, ValueError, KeyError, TypeError, AttributeError):
+        return set()
+    return {
+        name
+        for name in names
+        if isinstance(name, str) and Path(name).name == name and name.startswith(f"{path.stem}_")
+    }
 
 
 def describe(

@@ -194,6 +194,23 @@ def test_uncertainty_is_a_file_for_every_map_and_a_row_of_the_report(
     assert tall.width == short.width
 
 
+def test_maps_of_two_runs_never_mix(cli: Callable[..., int], photo: Path, here: Path) -> None:
+    folder = here / "wall_material"
+    assert cli(photo, "--iters", "1", "--uncertainty") == 0
+    (folder / "wall_notes.txt").write_text("mine")
+    assert cli(photo, "--iters", "2", "--format", "exr", "--no-report") == 0
+    names = {f"wall_{name}.exr" for name in ("normal", "diffuse", "specular", "roughness", "rendering")}
+    assert set(os.listdir(folder)) == names | {"wall.json", "wall_notes.txt"}
+    assert read_maps(folder, "wall").size == (40, 64)
+    # A record that names what is not a run's own removes nothing.
+    record = json.loads((folder / "wall.json").read_text())
+    record["maps"]["files"] |= {"a": "wall_notes.txt/../wall_notes.txt", "b": "other.png", "c": 3}
+    (folder / "wall.json").write_text(json.dumps(record))
+    (folder / "other.png").write_text("mine")
+    assert cli(photo, "--iters", "1", "--format", "exr", "--no-report") == 0
+    assert set(os.listdir(folder)) == names | {"wall.json", "wall_notes.txt", "other.png"}
+
+
 def test_a_given_light_and_camera_are_kept(cli: Callable[..., int], photo: Path, here: Path) -> None:
     options = ("--light", "0.2,-0.1,2.0", "--falloff", "inverse_square", "--camera", "collocated")
     assert cli(photo, "--iters", "2", "--no-report", *options) == 0
