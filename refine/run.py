@@ -36,6 +36,8 @@ def run_stages(
         progress: called after every iteration.
         engine: a name in `refine.engine.ENGINES`; None takes the fastest for the device.
 
+    Stages that move no map are passed over.
+
     Returns:
         The material and the losses of every stage. If the recipe has no iterations, or a material at the very
         ends of its range (`refine.parametrization`) explains the photos better than what the stages found,
@@ -54,6 +56,8 @@ def run_stages(
     parameters = Parameters.from_svbrdf(initial)
     finished = 0
     for stage in recipe.stages:
+        if not stage.moves:
+            continue
         clock = time.perf_counter()
         count = sum(name.split(" ")[0] == stage.name for name in losses)
         label = f"{stage.name} {count + 1}" if count else stage.name

@@ -46,6 +46,11 @@ class GlobalStage:
         """How logs and files call this stage."""
         return "global"
 
+    @property
+    def moves(self) -> bool:
+        """Whether any map moves."""
+        return bool(self.rates.moving())
+
     def scaled(self, iterations: int, pace: float) -> GlobalStage:
         """Return this stage with other iterations, and rates times a pace."""
         return replace(self, iterations=iterations, rates=self.rates.scaled(pace))
@@ -66,6 +71,11 @@ class PixelStage:
     def name(self) -> str:
         """How logs and files call this stage."""
         return "per-pixel"
+
+    @property
+    def moves(self) -> bool:
+        """Whether any map moves."""
+        return bool(self.rates.moving())
 
     def scaled(self, iterations: int, pace: float) -> PixelStage:
         """Return this stage with other iterations, and rates times a pace."""
@@ -110,6 +120,11 @@ class PosteriorStage:
     def name(self) -> str:
         """How logs and files call this stage."""
         return "posterior"
+
+    @property
+    def moves(self) -> bool:
+        """Whether any map moves."""
+        return bool(self.widths.moving())
 
     def scaled(self, iterations: int, pace: float) -> PosteriorStage:
         """Return this stage with other iterations; a solver that has converged does not go faster."""

@@ -22,7 +22,7 @@ from refine.fidelity import rerendering_rmse
 from refine.initialization import initialize
 from refine.maps import read_maps
 from refine.run import run_stages
-from refine.stages import RECIPES, GlobalStage, PixelStage, Rates, Recipe
+from refine.stages import RECIPES, GlobalStage, PixelStage, PosteriorStage, Rates, Recipe, Widths
 from tests.e2e.pictures import LIGHT, flash_photo, save_picture
 from tests.helpers import assert_close, seeded
 
@@ -217,6 +217,14 @@ def test_a_stage_that_comes_twice_keeps_both_histories() -> None:
     lengths = {name: len(curve) for name, curve in refined.losses.items()}
     assert lengths == {"initialization": 1, "per-pixel": 4, "global": 3, "per-pixel 2": 5}
     assert set(refined.seconds) == {"initialization", "per-pixel", "global", "per-pixel 2"}
+
+
+def test_a_stage_that_moves_nothing_is_passed_over() -> None:
+    still = (GlobalStage(2, Rates()), PixelStage(3, Rates()), PosteriorStage(2, Widths()))
+    refined = Refiner(wrong, Recipe("still", stages=still)).fit(picture(), light=FLASH)
+    assert set(refined.losses) == {"initialization"}
+    for name in MAPS:
+        assert_close(getattr(refined.svbrdf, name), getattr(refined.initial, name), atol=3e-3)
 
 
 def test_same_seed_same_maps_and_another_seed_others() -> None:
