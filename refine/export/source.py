@@ -40,9 +40,7 @@ def read_result(folder: Path, stem: str | None = None) -> Result:
     Raises:
         UserError: no folder, no result or several in it, or maps that cannot be read (see `read_maps`).
     """
-    if not folder.is_dir():
-        raise UserError(f"{folder} is not a folder; give one that refine wrote, such as slate_material.")
-    records = {path.stem: record for path in sorted(folder.glob("*.json")) if (record := _record(path))}
+    records = _records(folder)
     if stem is not None:
         records = {name: record for name, record in records.items() if name == stem}
     if not records:
@@ -64,6 +62,24 @@ def read_result(folder: Path, stem: str | None = None) -> Result:
     svbrdf = read_maps(folder, name, normal_convention=normals, extension=extension)
     maps = [folder / f"{name}_{each}.{extension}" for each in MAP_NAMES]
     return Result(svbrdf, name, sorted({*listed, *maps, folder / f"{name}.json"}), record)
+
+
+def result_names(folder: Path) -> list[str]:
+    """Return the stems of all results in a folder, sorted.
+
+    Raises:
+        UserError: there is no folder, or none in it.
+    """
+    names = list(_records(folder))
+    if not names:
+        raise UserError(f"There is no *.json of a result in {folder}; give a folder that refine wrote.")
+    return names
+
+
+def _records(folder: Path) -> dict[str, dict[str, Any]]:
+    if not folder.is_dir():
+        raise UserError(f"{folder} is not a folder; give one that refine wrote, such as slate_material.")
+    return {path.stem: record for path in sorted(folder.glob("*.json")) if (record := _record(path))}
 
 
 def _record(path: Path) -> dict[str, Any] | None:
