@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
 USER_ERROR, INTERRUPTED = 2, 130
 
-SUBCOMMANDS: dict[str, str] = {"export": "refine.export.cli:app"}
+SUBCOMMANDS: dict[str, str] = {"export": "refine.export.cli:app", "view": "refine.viewer.cli:app"}
 """Commands besides the default one, as `name: "module:typer_app"`; imported only when asked for."""
 
 QUICK_ITERATIONS = 50

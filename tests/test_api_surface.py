@@ -23,6 +23,7 @@ PUBLIC = {
     "refine.photo": "Photo photo_from_array read_photo",
     "refine.maps": "MapFormat map_paths read_maps write_maps",
     "refine.export": "TARGETS export_material",
+    "refine.viewer": "build_page",
     "refine.capture": "Capture",
     "nets.checkpoint": "CheckpointError Record load_model read_record save_model",
     "nets.generator": "Generator GeneratorConfig PAPER_GENERATOR NARROW_GENERATOR",
@@ -65,6 +66,7 @@ OPTIONS = {
     "refine.cli": "light falloff camera color-space resolution init recipe iters quick seed out format "
     "normals no-report export json quiet device threads version",
     "refine.export.cli": "to tile format name out quiet",
+    "refine.viewer.cli": "html no-browser quiet",
     "refine.train": "config data out pairs stage start resume steps vgg accelerator devices nodes threads "
     "seed save-every data-note",
 }
