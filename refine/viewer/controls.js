@@ -313,7 +313,7 @@ function onMove(event) {
   if (!from || !current) return;
   const to = place(event);
   if (pointers.size > 1) {
-    const [fixed] = [...pointers].find(([id]) => id !== event.pointerId).slice(1);
+    const [, {at: fixed}] = [...pointers].find(([id]) => id !== event.pointerId);
     const width = stage.clientWidth, height = stage.clientHeight;
     const apart = (a) => Math.hypot((a[0] - fixed[0]) * width, (a[1] - fixed[1]) * height) || 1;
     const middle = (a) => [(a[0] + fixed[0]) / 2, (a[1] + fixed[1]) / 2];
@@ -321,7 +321,7 @@ function onMove(event) {
     draw();
     zoomBy(apart(to) / apart(from.at), ...middle(to));
   } else if (from.pans) pan(from.at, to);
-  else if (state.mode === "orbit" && !event.altKey) turn((from.at[0] - to[0]) * 2, (to[1] - from.at[1]) * 1.6 * -1);
+  else if (state.mode === "orbit" && !event.altKey) turn((from.at[0] - to[0]) * 2, (to[1] - from.at[1]) * 1.6);
   else {
     const point = unproject(view, ...to);
     if (point) moveLight(...point);
