@@ -286,7 +286,7 @@ const ACTIONS = {
 };
 
 function onKey(event) {
-  if (event.ctrlKey || event.metaKey || event.altKey || !current || ($$("help").open && !"?h".includes(event.key))) return;
+  if (event.ctrlKey || event.metaKey || event.altKey || !view || ($$("help").open && !"?h".includes(event.key))) return;
   const target = event.target.tagName;
   if (target === "SELECT" || (target === "INPUT" && /^(Arrow|Page)/.test(event.key))) return;
   if (target === "BUTTON" && event.key === " ") return;
@@ -310,7 +310,7 @@ const place = (event) => {
 
 function onMove(event) {
   const from = pointers.get(event.pointerId);
-  if (!from || !current) return;
+  if (!from || !view) return;
   const to = place(event);
   if (pointers.size > 1) {
     const [, {at: fixed}] = [...pointers].find(([id]) => id !== event.pointerId);
@@ -342,7 +342,7 @@ function listen() {
   canvas.addEventListener("dblclick", () => { Object.assign(state, {zoom: 1, center: [0, 0]}); refresh(); });
   stage.addEventListener("wheel", (event) => {
     event.preventDefault();
-    zoomBy(Math.exp(-event.deltaY * (event.deltaMode ? 0.05 : 0.0015)), ...place(event));
+    if (view) zoomBy(Math.exp(-event.deltaY * (event.deltaMode ? 0.05 : 0.0015)), ...place(event));
   }, {passive: false});
   const divider = $$("divider");
   divider.addEventListener("pointerdown", (event) => divider.setPointerCapture(event.pointerId));

@@ -27,7 +27,7 @@ from refine.maps import MAP_NAMES, MapFormat, write_image
 from refine.photo import ColorSpaceChoice, read_photo, resize_photo
 
 LONGEST_SIDE = 1024
-"""Longer side of the maps in a page, in pixels: 16 MB of text at most for a material."""
+"""Longer side of the maps in a page, in pixels: 28 MB of text at most for the maps of a material."""
 
 
 def describe_material(folder: Path, stem: str) -> dict[str, Any]:
