@@ -17,6 +17,7 @@ import torch
 import typer
 from typer.main import get_command
 
+from refine.cli import SUBCOMMANDS
 from refine.maps import read_maps
 from refine.refiner import Refined
 
@@ -91,6 +92,8 @@ def test_commands_are_found() -> None:
 @pytest.mark.parametrize("words", commands(), ids=" ".join)
 def test_commands_know_their_options(words: list[str]) -> None:
     module = words[2] if words[0] == "python" else MODULES[words[0]]
+    if words[0] == "refine" and words[1] in SUBCOMMANDS:
+        module = SUBCOMMANDS[words[1]].partition(":")[0]
     used = {word.partition("=")[0] for word in words[3 if words[0] == "python" else 1 :] if word[0] == "-"}
     assert used <= offered(module) | {"--help"}
 
