@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import http.client
 import os
 import signal
@@ -61,7 +62,9 @@ def test_mistakes_end_in_one_sentence(
 @pytest.mark.skipif(os.name == "nt", reason="Ctrl-C is sent as a POSIX signal")
 def test_it_serves_until_ctrl_c(result: Path) -> None:
     command = [sys.executable, "-m", "refine.cli", "view", str(result), "--no-browser"]
-    with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as process:
+    # What a shell starts in its background ignores SIGINT, and so would the server.
+    listening = functools.partial(signal.signal, signal.SIGINT, signal.SIG_DFL)
+    with subprocess.Popen(command, stderr=subprocess.PIPE, text=True, preexec_fn=listening) as process:
         assert process.stderr is not None
         told = process.stderr.readline()
         host, _, port = told.partition("http://")[2].partition("/")[0].partition(":")
