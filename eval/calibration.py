@@ -94,7 +94,7 @@ def lights_finder(refiner: Refiner) -> LightsFinder:
 
     def find(photos: Sequence[Path]) -> Float[Tensor, "photos 3"]:
         refined = refiner.fit_many(photos, iters=0)
-        lights = [refined.light, *(capture.light for capture in refined.others)]
+        lights = [capture.light for capture in refined.captures]
         return torch.cat([light.position.cpu() for light in lights if light is not None])
 
     return find

@@ -23,6 +23,15 @@ from eval.development import (
     require,
 )
 from eval.lights import evaluate_lights, light_estimator, lights_markdown
+from eval.options import (
+    MatchExposure,
+    NovelLights,
+    ProtocolSeed,
+    RefinementSeed,
+    SceneLightsFile,
+    Scenes,
+    Size,
+)
 from eval.photos import find_photos, photos_markdown, score_photos
 from eval.real import evaluate_real, real_estimator, real_markdown
 from eval.real_scenes import CAMERA, list_real_scenes, read_scene_lights
@@ -43,8 +52,6 @@ Checkpoints = Annotated[
 ]
 RecipeName = Annotated[str, typer.Option(help=f"none, or {', '.join(sorted(RECIPES))}.")]
 Iterations = Annotated[int | None, typer.Option(min=0, help="Iterations; the recipe's own by default.")]
-Scenes = Annotated[int | None, typer.Option(min=1, help="Scenes per set, evenly spread; all.")]
-Size = Annotated[int, typer.Option(min=64, help="Pixels of photo and maps.")]
 Flips = Annotated[bool, typer.Option(help="Average the network over four mirrored photos.")]
 Threads = Annotated[int, typer.Option(min=0, help="CPU threads; 0 leaves torch's choice.")]
 JsonFile = Annotated[Path | None, typer.Option("--json", help="Write everything here.")]
@@ -64,8 +71,8 @@ def development(
     iters: Iterations = None,
     scenes: Scenes = None,
     size: Size = SIZE,
-    lights: Annotated[int, typer.Option(min=1, help="Novel lights per scene.")] = NOVEL_LIGHTS,
-    seed: Annotated[int, typer.Option(min=0, help="Of the novel lights and of refinement.")] = 0,
+    lights: NovelLights = NOVEL_LIGHTS,
+    seed: ProtocolSeed = 0,
     estimate_light: Annotated[bool, typer.Option(help="Do not tell the method the photo's light.")] = False,
     flips: Flips = True,
     stored_input: Annotated[bool, typer.Option(help="Use the photos stored in strips.")] = False,
@@ -101,7 +108,7 @@ def ablations(
     data: Data,
     init: Checkpoint = "default",
     scenes: Scenes = None,
-    lights: Annotated[int, typer.Option(min=1, help="Novel lights per scene.")] = NOVEL_LIGHTS,
+    lights: NovelLights = NOVEL_LIGHTS,
     threads: Threads = 0,
     json_file: JsonFile = None,
     markdown_file: MarkdownFile = None,
@@ -128,13 +135,9 @@ def real(
     iters: Iterations = None,
     scenes: Scenes = None,
     size: Size = SIZE,
-    seed: Annotated[int, typer.Option(min=0, help="Of refinement.")] = 0,
-    lights: Annotated[
-        Path | None, typer.Option(help="Lights of the scenes, of python -m eval.scene_lights.")
-    ] = None,
-    match_exposure: Annotated[
-        bool, typer.Option(help="Refine under a light as bright as the initialization needs it, not 1.")
-    ] = False,
+    seed: RefinementSeed = 0,
+    lights: SceneLightsFile = None,
+    match_exposure: MatchExposure = False,
     flips: Flips = True,
     threads: Threads = 0,
     json_file: JsonFile = None,

@@ -68,7 +68,7 @@ def find_scene_lights(refiner: Refiner, scene: Scene) -> SceneLights:
         positions = torch.from_numpy(scene.positions)
         known = PointLight(positions, torch.ones(len(positions), 3), "inverse_square")
     refined = refiner.fit_many(scene.photos, lights=known)
-    lights = [refined.light, *(capture.light for capture in refined.others)]
+    lights = [capture.light for capture in refined.captures]
     return SceneLights(
         [[round(float(value), 4) for value in light.position[0]] for light in lights if light is not None],
         [round(float(light.intensity[0, 0]), 4) for light in lights if light is not None],
@@ -122,9 +122,9 @@ def scene_lights_markdown(
 def _residual(refined: Refined) -> float:
     """Return the re-renderings' RMSE over all photos."""
     squares = []
-    for capture, light in ((refined.capture, refined.light), *((c, c.light) for c in refined.others)):
-        assert light is not None
-        error = rerendering_rmse(render_in_bands(refined.svbrdf, light, capture.camera), capture)
+    for capture in refined.captures:
+        assert capture.light is not None
+        error = rerendering_rmse(render_in_bands(refined.svbrdf, capture.light, capture.camera), capture)
         squares.append(0.0 if error is None else error**2)
     return (sum(squares) / len(squares)) ** 0.5
 

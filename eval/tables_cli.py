@@ -16,6 +16,15 @@ from eval.datasets import Protocol as Settings
 from eval.held_out import NAME as BUILT_IN
 from eval.ledger import Ledger
 from eval.methods import METHODS, Method, Row, choose, find_weights, parse_inits
+from eval.options import (
+    MatchExposure,
+    NovelLights,
+    ProtocolSeed,
+    RefinementSeed,
+    SceneLightsFile,
+    Scenes,
+    Size,
+)
 from eval.real_scenes import read_scene_lights
 from eval.report import origin, provenance
 from eval.table_runs import Run, measure
@@ -35,13 +44,11 @@ Out = Annotated[
 Names = Annotated[
     list[str] | None, typer.Option("--rows", help=f"All, or some, comma-separated, of {', '.join(METHODS)}.")
 ]
-Scenes = Annotated[int | None, typer.Option(min=1, help="Scenes per set, evenly spread; all.")]
 Quick = Annotated[bool, typer.Option("--quick", help="8 scenes of Table 1, 3 of Table 2.")]
 Inits = Annotated[
     list[str] | None,
     typer.Option("--init", help="ROW=CHECKPOINT: a row's weights, a shipped name or a file."),
 ]
-Size = Annotated[int, typer.Option(min=64, help="Pixels of photo and maps.")]
 Flips = Annotated[bool, typer.Option(help="Average networks over four mirrored photos.")]
 Workers = Annotated[int, typer.Option(min=1, help="Processes, of one CPU thread each.")]
 
@@ -57,8 +64,8 @@ def table1(
     quick: Quick = False,
     init: Inits = None,
     size: Size = SIZE,
-    lights: Annotated[int, typer.Option(min=1, help="Novel lights per scene.")] = NOVEL_LIGHTS,
-    seed: Annotated[int, typer.Option(min=0, help="Of the novel lights and of refinement.")] = 0,
+    lights: NovelLights = NOVEL_LIGHTS,
+    seed: ProtocolSeed = 0,
     estimate_light: Annotated[bool, typer.Option(help="Do not tell the methods the photo's light.")] = False,
     flips: Flips = True,
     workers: Workers = 1,
@@ -79,13 +86,9 @@ def table2(
     quick: Quick = False,
     init: Inits = None,
     size: Size = SIZE,
-    seed: Annotated[int, typer.Option(min=0, help="Of refinement.")] = 0,
-    lights: Annotated[
-        Path | None, typer.Option(help="Lights of the scenes, of python -m eval.scene_lights.")
-    ] = None,
-    match_exposure: Annotated[
-        bool, typer.Option(help="Refine under a light as bright as the initialization needs it, not 1.")
-    ] = False,
+    seed: RefinementSeed = 0,
+    lights: SceneLightsFile = None,
+    match_exposure: MatchExposure = False,
     flips: Flips = True,
     workers: Workers = 1,
 ) -> None:

@@ -102,9 +102,10 @@ def measure(
 
 def fit_model(refiner: Refiner, data: Path, count: int, seed: int, about: dict[str, Any]) -> ErrorModel:
     """Regress the logarithm of errors on features, then scale deviations to the errors' size."""
+    results = list(held_out(refiner, data, count, seed))
     seen, errors = [], []
-    for truth, refined, pixels in held_out(refiner, data, count, seed):
-        seen.append(with_means(features(refined.initial, refined.svbrdf, known(refined)))[pixels])
+    for truth, refined, pixels in results:
+        seen.append(with_means(features(refined.initial, refined.svbrdf, refined.capture))[pixels])
         errors.append(map_errors(refined.svbrdf, truth)[pixels])
     x, y = torch.cat(seen).double(), torch.cat(errors).double()
     mean, deviation = x.mean(dim=0), x.std(dim=0).clamp(min=1e-6)
@@ -118,10 +119,8 @@ def fit_model(refiner: Refiner, data: Path, count: int, seed: int, about: dict[s
         scale=dict.fromkeys(MAPS, 1.0),
         origin=about,
     )
-    found = []
-    for _truth, refined, pixels in held_out(refiner, data, count, seed):
-        found.append(stacked(refined, model)[pixels])
-    ratios = rms(y) / rms(torch.cat(found).double())
+    found = torch.cat([stacked(refined, model)[pixels] for _, refined, pixels in results])
+    ratios = rms(y) / rms(found.double())
     return replace(model, scale=dict(zip(MAPS, _rounded(ratios), strict=True)))
 
 
@@ -164,7 +163,7 @@ def map_errors(estimate: SVBRDF, truth: SVBRDF) -> Float[Tensor, "pixels 4"]:
 
 def stacked(refined: Refined, model: ErrorModel | None = None) -> Float[Tensor, "pixels 4"]:
     """Return a result's deviations by pixel."""
-    found = deviations(refined.initial, refined.svbrdf, known(refined), model)
+    found = deviations(refined.initial, refined.svbrdf, refined.captures, model)
     return torch.stack([found[name].flatten() for name in MAPS], dim=1)
 
 
@@ -188,11 +187,6 @@ def uncertainty_markdown(results: UncertaintyResults) -> str:
         f"{origin(results.settings)}."
     )
     return "\n".join([caption, "", *markdown_table(heads, rows, 1), ""])
-
-
-def known(refined: Refined) -> Any:
-    """Return the photo that was explained, with the light it was explained under."""
-    return replace(refined.capture, light=refined.light)
 
 
 def rms(values: Tensor) -> Tensor:

@@ -96,10 +96,24 @@ def distance_in_bands(svbrdf: SVBRDF, capture: Capture) -> float:
     return total / height
 
 
+def cut(svbrdf: SVBRDF, rows: slice) -> SVBRDF:
+    """Return some rows of a material."""
+    return svbrdf.map(lambda tensor: tensor[..., rows, :])
+
+
+def rows_geometry(
+    svbrdf: SVBRDF, rows: slice, light: PointLight | None, camera: Camera | None = None
+) -> Geometry:
+    """Return the shading geometry of some rows of a whole material, in its type and on its device.
+
+    Raises:
+        ValueError: the light is not known.
+    """
+    height, width = svbrdf.size
+    pixels = torch.arange(rows.start * width, rows.stop * width, device=svbrdf.normal.device)
+    dtype = svbrdf.normal.dtype
+    return pixel_geometry(pixels.reshape(-1, width), (height, width), light, camera, dtype=dtype)
+
+
 def _shade_rows(svbrdf: SVBRDF, rows: slice, light: PointLight | None, camera: Camera | None) -> Tensor:
-    band = svbrdf.map(lambda tensor: tensor[..., rows, :])
-    width = band.size[1]
-    pixels = torch.arange(rows.start * width, rows.stop * width, device=band.normal.device)
-    dtype = band.normal.dtype
-    geometry = pixel_geometry(pixels.reshape(-1, width), svbrdf.size, light, camera, dtype=dtype)
-    return shade(band, geometry)
+    return shade(cut(svbrdf, rows), rows_geometry(svbrdf, rows, light, camera))

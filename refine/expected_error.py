@@ -27,6 +27,7 @@ from nets.svbrdf import MAPS, SVBRDF
 from refine.bands import render_in_bands
 from refine.capture import Capture
 from refine.initialization import NETWORK_SIZE
+from refine.upsampling import legal
 
 FEATURES = (
     "contradiction",
@@ -175,9 +176,7 @@ def features(initial: SVBRDF, refined: SVBRDF, capture: Capture) -> Float[Tensor
 
 def shrink(svbrdf: SVBRDF) -> SVBRDF:
     """Return the material at no more than the network's size."""
-    small = svbrdf.map(_shrink)
-    normal = functional.normalize(small.normal, dim=1)
-    return SVBRDF(normal, small.diffuse, small.roughness, small.specular)
+    return legal(svbrdf.map(_shrink))
 
 
 def shrink_capture(capture: Capture) -> Capture:

@@ -78,6 +78,11 @@ class Refined:
         """Render the refined maps, linear `[1, 3, H, W]`; defaults to the photo's light and camera."""
         return render_in_bands(self.svbrdf, light or self.light, camera or self.camera)
 
+    @property
+    def captures(self) -> tuple[Capture, ...]:
+        """All photos that were explained, each with its light."""
+        return self.capture, *self.others
+
     @cached_property
     def deviations(self) -> dict[str, Float[Tensor, "1 1 h w"]]:
         """How far each map is likely to be off, by map name, in its units; see `refine.uncertainty`.
@@ -85,8 +90,7 @@ class Refined:
         Computed when it is first asked for. The errors it expects beforehand were measured with the shipped
         network and the recipe `default`; with others it is a rougher guess.
         """
-        photos = [replace(self.capture, light=self.light), *self.others]
-        return deviations(self.initial, self.svbrdf, photos)
+        return deviations(self.initial, self.svbrdf, self.captures)
 
     def save(
         self,

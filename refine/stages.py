@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import asdict, dataclass, field, replace
 from itertools import pairwise
-from typing import Any
+from typing import Any, TypeVar
 
 import torch
 
@@ -34,8 +34,28 @@ class Rates:
         return {name: rate for name in MAPS if (rate := getattr(self, name)) > 0.0}
 
 
+Descent = TypeVar("Descent", bound="_Descent")
+
+
 @dataclass(frozen=True)
-class GlobalStage:
+class _Descent:
+    """What stages of Adam steps have in common."""
+
+    iterations: int
+    rates: Rates
+
+    @property
+    def moves(self) -> bool:
+        """Whether any map moves."""
+        return bool(self.rates.moving())
+
+    def scaled(self: Descent, iterations: int, pace: float) -> Descent:
+        """Return this stage with other iterations, and rates times a pace."""
+        return replace(self, iterations=iterations, rates=self.rates.scaled(pace))
+
+
+@dataclass(frozen=True)
+class GlobalStage(_Descent):
     """Move some maps as a whole: every pixel by the gradient averaged over all pixels (paper Sec. 6.1)."""
 
     iterations: int = 40
@@ -46,22 +66,13 @@ class GlobalStage:
         """How logs and files call this stage."""
         return "global"
 
-    @property
-    def moves(self) -> bool:
-        """Whether any map moves."""
-        return bool(self.rates.moving())
-
-    def scaled(self, iterations: int, pace: float) -> GlobalStage:
-        """Return this stage with other iterations, and rates times a pace."""
-        return replace(self, iterations=iterations, rates=self.rates.scaled(pace))
-
     def offsets(self, height: int, width: int) -> dict[str, torch.Tensor]:
         """Return the zero offsets that this stage optimises: one per channel."""
         return {name: torch.zeros(1, PARAMETER_COUNTS[name], 1, 1) for name in self.rates.moving()}
 
 
 @dataclass(frozen=True)
-class PixelStage:
+class PixelStage(_Descent):
     """Move some maps pixel by pixel."""
 
     iterations: int = 260
@@ -71,15 +82,6 @@ class PixelStage:
     def name(self) -> str:
         """How logs and files call this stage."""
         return "per-pixel"
-
-    @property
-    def moves(self) -> bool:
-        """Whether any map moves."""
-        return bool(self.rates.moving())
-
-    def scaled(self, iterations: int, pace: float) -> PixelStage:
-        """Return this stage with other iterations, and rates times a pace."""
-        return replace(self, iterations=iterations, rates=self.rates.scaled(pace))
 
     def offsets(self, height: int, width: int) -> dict[str, torch.Tensor]:
         """Return the zero offsets that this stage optimises: one per channel and pixel."""

@@ -16,7 +16,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from nets.svbrdf import MAPS, SVBRDF
-from refine.bands import bands, pixel_geometry
+from refine.bands import bands, cut, rows_geometry
 from refine.capture import Capture
 from refine.engine.gauss_newton import posterior_deviations
 from refine.expected_error import ErrorModel, expected_errors
@@ -56,10 +56,9 @@ def deviations(
     model = model or ErrorModel.shipped()
     photos = [captures] if isinstance(captures, Capture) else list(captures)
     expected = expected_errors(initial, refined, photos[0], model)
-    height, width = refined.size
     found = {name: torch.empty_like(refined.roughness) for name in MAPS}
-    for rows in bands(height, width):
-        parameters = Parameters.from_svbrdf(_cut(refined, rows))
+    for rows in bands(*refined.size):
+        parameters = Parameters.from_svbrdf(cut(refined, rows))
         slopes = _slopes(parameters)
         widths = Parameters(
             *(
@@ -70,11 +69,7 @@ def deviations(
             )
         )
         parts = [_rows(photo, rows) for photo in photos]
-        pixels = torch.arange(rows.start * width, rows.stop * width, device=refined.normal.device)
-        geometries = [
-            pixel_geometry(pixels.reshape(-1, width), refined.size, photo.light, photo.camera)
-            for photo in photos
-        ]
+        geometries = [rows_geometry(refined, rows, photo.light, photo.camera) for photo in photos]
         narrowed = posterior_deviations(
             parameters, parts, geometries, widths=widths, noise=NOISE, huber=HUBER
         )
@@ -87,10 +82,6 @@ def deviations(
 
 PER_COMPONENT = {"normal": 1.5**0.5}
 """A normal's error is a mean over three components, of which a normal that points up can move two."""
-
-
-def _cut(svbrdf: SVBRDF, rows: slice) -> SVBRDF:
-    return svbrdf.map(lambda tensor: tensor[..., rows, :])
 
 
 def _rows(photo: Capture, rows: slice) -> Capture:

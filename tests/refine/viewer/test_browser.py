@@ -11,6 +11,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from eval.benchmarks.browser import FLAGS as WEBGL_FLAGS
 from nets.color import linear_to_srgb
 from nets.render import Camera, PointLight, render
 from refine.files import decode_image
@@ -22,11 +23,7 @@ from .conftest import HEIGHT, WIDTH, WriteResult
 BROWSERS = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
 BROWSER = next(filter(None, map(shutil.which, BROWSERS)), None)
 FLAGS = (
-    "--headless=new",
-    "--no-sandbox",
-    "--use-gl=angle",
-    "--use-angle=swiftshader",
-    "--enable-unsafe-swiftshader",
+    *WEBGL_FLAGS,
     "--force-device-scale-factor=1",
     "--force-color-profile=srgb",
     "--hide-scrollbars",
