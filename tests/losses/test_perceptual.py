@@ -1,7 +1,8 @@
 """LPIPS against numbers of the reference implementation, its errors and its gradients.
 
-The expected values were printed by the `lpips` 0.1.4 package itself (its own `LPIPS(net="alex")`, its
-heads, torchvision's fp32 AlexNet) on the pictures that `picture` draws: analytic, so that they need no file.
+The expected values were printed by the `lpips` 0.1.4 package itself (its own `LPIPS(net="alex")` and
+`LPIPS(net="vgg")`, its heads, torchvision's fp32 weights) on the pictures that `picture` draws: analytic, so
+that they need no file.
 """
 
 import io
@@ -12,21 +13,26 @@ from pathlib import Path
 import pytest
 import torch
 from safetensors import safe_open
+from safetensors.torch import load_file
 from torch import Tensor
+from torch.nn import functional
 
-from losses.fetch_weights import FEATURES, HEADS, NumpyUnpickler
-from losses.perceptual import LPIPS, LPIPS_ALEX
+from losses.fetch_weights import FEATURES, HEADS, VGG_HEADS, NumpyUnpickler
+from losses.perceptual import INPUT_SCALE, INPUT_SHIFT, LPIPS, LPIPS_ALEX, LPIPS_VGG_HEADS, LPIPSVGG
+from losses.vgg import BLOCKS
+from losses.vgg_weights import VGGWeightsMissing, load_vgg16
+from tests.helpers import seeded
 
 SHAPE = (96, 128)
 
-# kind of the first picture, kind of the second, the reference package's distance
+# kind of the first picture, kind of the second, the reference package's distances with AlexNet and VGG-16
 REFERENCE = [
-    ("stripes", "checks", 0.50910),
-    ("stripes", "shifted", 0.03441),
-    ("stripes", "dimmed", 0.02449),
-    ("checks", "noise", 0.97167),
-    ("blobs", "dimmed", 0.69472),
-    ("blobs", "noise", 1.55436),
+    ("stripes", "checks", 0.50910, 0.70520),
+    ("stripes", "shifted", 0.03441, 0.20694),
+    ("stripes", "dimmed", 0.02449, 0.02375),
+    ("checks", "noise", 0.97167, 0.72849),
+    ("blobs", "dimmed", 0.69472, 0.78060),
+    ("blobs", "noise", 1.55436, 0.95176),
 ]
 
 
@@ -55,10 +61,66 @@ def picture(kind: str) -> Tensor:
     return image[None].float()
 
 
-@pytest.mark.parametrize(("first", "second", "expected"), REFERENCE)
-def test_agrees_with_the_reference_package(distance: LPIPS, first: str, second: str, expected: float) -> None:
+@pytest.mark.parametrize(("first", "second", "expected", "_"), REFERENCE)
+def test_agrees_with_the_reference_package(
+    distance: LPIPS, first: str, second: str, expected: float, _: float
+) -> None:
     found = float(distance(picture(first), picture(second)))
     assert found == pytest.approx(expected, abs=0.001)
+
+
+@pytest.fixture(scope="module")
+def vgg_state() -> dict[str, Tensor]:
+    """Random weights of VGG-16's widths."""
+    generator, state, inputs = seeded(0), {}, 3
+    for block, (count, width) in enumerate(zip(BLOCKS, (64, 128, 256, 512, 512), strict=True), 1):
+        for n in range(1, count + 1):
+            weight = torch.randn(width, inputs, 3, 3, generator=generator) * (2.0 / (9 * inputs)) ** 0.5
+            state |= {f"conv{block}_{n}.weight": weight, f"conv{block}_{n}.bias": torch.zeros(width)}
+            inputs = width
+    return state
+
+
+def test_vgg_is_its_formula(vgg_state: dict[str, Tensor]) -> None:
+    a, b = (2.0 * torch.rand(1, 3, 32, 48, generator=seeded(seed)) - 1.0 for seed in (1, 2))
+    heads = load_file(LPIPS_VGG_HEADS)
+    expected = 0.0
+    x = [
+        (image - torch.tensor(INPUT_SHIFT).view(3, 1, 1)) / torch.tensor(INPUT_SCALE).view(3, 1, 1)
+        for image in (a, b)
+    ]
+    for block, count in enumerate(BLOCKS, 1):
+        x = [functional.max_pool2d(image, 2) for image in x] if block > 1 else x
+        for n in range(1, count + 1):
+            weight = vgg_state[f"conv{block}_{n}.weight"]
+            x = [functional.conv2d(image, weight, padding=1).clamp(min=0.0) for image in x]
+        unit = [image / (image.square().sum(dim=1, keepdim=True).sqrt() + 1e-10) for image in x]
+        per_pixel = ((unit[0] - unit[1]) ** 2 * heads[f"heads.{block - 1}"].view(1, -1, 1, 1)).sum(dim=1)
+        expected += float(per_pixel.mean())
+    vgg = LPIPSVGG(vgg_state)
+    assert float(vgg(a, b)) == pytest.approx(expected, rel=1e-4)
+    assert float(vgg(a, a)) == 0.0
+    with pytest.raises(ValueError, match=r"at least 16 px"):
+        vgg(a[..., :15], b[..., :15])
+
+
+def test_vgg_agrees_with_the_reference_package() -> None:
+    try:
+        vgg = LPIPSVGG(load_vgg16())
+    except VGGWeightsMissing as error:
+        pytest.skip(str(error))
+    for first, second, _, expected in REFERENCE:
+        assert float(vgg(picture(first), picture(second))) == pytest.approx(expected, abs=0.001)
+
+
+def test_the_shipped_heads_of_vgg_name_their_source() -> None:
+    with safe_open(LPIPS_VGG_HEADS, framework="pt") as file:
+        record = json.loads(file.metadata()["record"])
+    assert record["heads_sha256"] == VGG_HEADS.member_sha256
+    assert LPIPS_VGG_HEADS.name in (LPIPS_ALEX.parent / "NOTICE").read_text()
+    heads = load_file(LPIPS_VGG_HEADS)
+    assert [len(heads[f"heads.{i}"]) for i in range(5)] == [64, 128, 256, 512, 512]
+    assert all(bool((head >= 0.0).all()) for head in heads.values())
 
 
 def test_a_batch_is_its_pairs(distance: LPIPS) -> None:
