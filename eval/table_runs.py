@@ -72,7 +72,8 @@ class Bench:
             )
         refiner, refine = self._refiners[trial.row], row.method.recipe is not None
         try:
-            return yardstick.score(self._scene[1], refiner, self.lpips, refine=refine)
+            refined = yardstick.answer(self._scene[1], refiner, refine=refine)
+            return yardstick.score(self._scene[1], refined, self.lpips)
         except ValueError as error:  # maps that cannot be scored: the row's fault
             return Failure(str(error), of_scene=False)
 

@@ -64,8 +64,11 @@ class Yardstick(Protocol):
     def read(self, index: int) -> Any:
         """Read a scene; raises `DataError`."""
 
-    def score(self, scene: Any, refiner: Refiner, lpips: LPIPS, *, refine: bool) -> dict[str, Any]:
-        """Return scores and seconds of the network's answer, or of its refinement."""
+    def answer(self, scene: Any, refiner: Refiner, *, refine: bool) -> Refined:
+        """Return the network's answer to the scene's photo, or its refinement."""
+
+    def score(self, scene: Any, refined: Refined, lpips: LPIPS) -> dict[str, Any]:
+        """Return the answer's scores and seconds; raises `ValueError` for maps that cannot be scored."""
 
 
 @dataclass(frozen=True)
@@ -146,10 +149,13 @@ class Synthetic:
         kind, paths = self._paths()
         return read_scene(paths[index], kind, index, self.protocol)
 
-    def score(self, scene: Scene, refiner: Refiner, lpips: LPIPS, *, refine: bool) -> dict[str, Any]:
-        """Return scores and seconds of the network's answer, or of its refinement."""
+    def answer(self, scene: Scene, refiner: Refiner, *, refine: bool) -> Refined:
+        """Return the network's answer to the scene's photo, or its refinement."""
         light = None if self.estimate_light else scene.photo_light
-        refined = refiner.fit(as_photo(scene), light=light, iters=None if refine else 0)
+        return refiner.fit(as_photo(scene), light=light, iters=None if refine else 0)
+
+    def score(self, scene: Scene, refined: Refined, lpips: LPIPS) -> dict[str, Any]:
+        """Return the answer's scores and seconds."""
         scores = evaluate_material(refined.svbrdf, scene.truth, scene.lights, CAMERA, lpips=lpips)
         return asdict(scores) | {"seconds": _seconds(refined)}
 
@@ -229,13 +235,16 @@ class Real:
         path = list_real_scenes(self.folder)[index]
         return read_real_scene(path, self.size, self.lights.get(path.name))
 
-    def score(self, scene: RealScene, refiner: Refiner, lpips: LPIPS, *, refine: bool) -> dict[str, Any]:
-        """Return scores and seconds of the network's answer, or of its refinement."""
+    def answer(self, scene: RealScene, refiner: Refiner, *, refine: bool) -> Refined:
+        """Return the network's answer to the scene's photo, or its refinement."""
         light = scene.light
         if refine and self.match_exposure:
             first = refiner.fit(scene.photo, light=light, iters=0)
             light = replace(light, intensity=exposure(first.initial, scene) * light.intensity)
-        refined = refiner.fit(scene.photo, light=light, iters=None if refine else 0)
+        return refiner.fit(scene.photo, light=light, iters=None if refine else 0)
+
+    def score(self, scene: RealScene, refined: Refined, lpips: LPIPS) -> dict[str, Any]:
+        """Return the answer's scores and seconds; raises `ValueError` if it renders to NaN."""
         factor, rendering, distance = score_estimate(refined.svbrdf, scene, lpips)
         if not (math.isfinite(rendering) and math.isfinite(distance)):
             raise ValueError("the estimate renders to NaN or infinity")
