@@ -6,6 +6,7 @@ import json
 import pickle
 import warnings
 import zipfile
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
@@ -15,6 +16,10 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save as serialize
 from torch import Tensor
 
+from nets.architectures import CONFIGS, Network, NetworkConfig, build, find_config, kind_of
+from nets.baselines.autoencoder import Autoencoder
+from nets.baselines.des18 import Des18
+from nets.baselines.des19 import Des19
 from nets.generator import PAPER_GENERATOR, Generator, GeneratorConfig
 from nets.svbrdf import MAPS
 
@@ -37,21 +42,21 @@ class Record:
     """What a checkpoint says of itself.
 
     Attributes:
-        architecture: the generator's shape.
+        architecture: the network's shape.
         training: iterations, samples, seconds, every setting.
         data: what it was trained on, with licences.
         licence: of the weights.
     """
 
-    architecture: GeneratorConfig
+    architecture: NetworkConfig
     training: dict[str, Any] = field(default_factory=dict)
     data: list[str] = field(default_factory=list)
     licence: str = "Apache-2.0"
 
 
-def save_model(path: Path, network: Generator, record: Record) -> None:
+def save_model(path: Path, network: Network, record: Record) -> None:
     """Write weights as float16 safetensors, header included, by write-and-rename."""
-    header = {"format": FORMAT, **asdict(record)}
+    header = {"format": FORMAT, "kind": kind_of(record.architecture), **asdict(record)}
     tensors = {name: value.detach().half().contiguous() for name, value in network.state_dict().items()}
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = path.with_suffix(".partial")
@@ -59,8 +64,8 @@ def save_model(path: Path, network: Generator, record: Record) -> None:
     temporary.replace(path)
 
 
-def load_model(name: str | Path = "default") -> Generator:
-    """Load a generator ready for `predict`.
+def load_model(name: str | Path = "default") -> Generator | Des18 | Des19:
+    """Load a network ready for `predict`.
 
     Args:
         name: a shipped checkpoint's name (`default`), a `.safetensors` file of ours, or the authors' `.pth`.
@@ -69,6 +74,26 @@ def load_model(name: str | Path = "default") -> Generator:
         CheckpointError: no such file, not a checkpoint, another architecture, NaN weights, or a pickle
             that would run code.
     """
+    network = load_network(name)
+    if isinstance(network, Autoencoder):
+        raise CheckpointError(
+            f"{name}: an auto-encoder of materials, which says nothing of a photo; give a network of photos"
+        )
+    return network
+
+
+def load_autoencoder(name: str | Path) -> Autoencoder:
+    """Load an auto-encoder of materials; arguments and errors as `load_model`."""
+    network = load_network(name)
+    if not isinstance(network, Autoencoder):
+        raise CheckpointError(
+            f"{name}: a network of photos, not an auto-encoder of materials; give one such as gao19"
+        )
+    return network
+
+
+def load_network(name: str | Path) -> Network:
+    """Load a network of any kind; arguments and errors as `load_model`."""
     path = resolve(name)
     network = _load_authors(path) if path.suffix in {".pth", ".pt", ".tar"} else _load_own(path)
     for parameter_name, parameter in network.named_parameters():
@@ -107,16 +132,24 @@ def read_record(name: str | Path) -> Record:
         header = json.loads(metadata[HEADER_KEY])
         if header.pop("format") != FORMAT:
             raise KeyError
-        return Record(**{**header, "architecture": GeneratorConfig(**header["architecture"])})
+        # Files of before there were other kinds do not name theirs.
+        kind = header.pop("kind", "generator")
+        if kind in CONFIGS:
+            return Record(**{**header, "architecture": CONFIGS[kind](**header["architecture"])})
     except (AttributeError, KeyError, TypeError, ValueError):
         raise CheckpointError(
-            f"{path}: safetensors, but not a generator of this library; give one written by refine-train"
+            f"{path}: safetensors, but not a network of this library; give one written by refine-train"
         ) from None
+    raise CheckpointError(
+        f"{path}: another architecture, {kind!r}; the known ones are {', '.join(CONFIGS)}, a newer version "
+        "may know more"
+    )
 
 
-def _load_own(path: Path) -> Generator:
+def _load_own(path: Path) -> Network:
     record = read_record(path)
-    network = _without_weights(path, record.architecture.as_dict())
+    architecture = record.architecture
+    network = _without_weights(path, kind_of(architecture), architecture.as_dict())
     expected = {name: tuple(tensor.shape) for name, tensor in network.state_dict().items()}
     with safe_open(path, "pt") as file:
         found = {name: tuple(file.get_slice(name).get_shape()) for name in file.keys()}  # noqa: SIM118
@@ -126,7 +159,7 @@ def _load_own(path: Path) -> Generator:
     return network
 
 
-def _load_authors(path: Path) -> Generator:
+def _load_authors(path: Path) -> Network:
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # about pickles that are refused anyway
@@ -151,20 +184,20 @@ def _load_authors(path: Path) -> Generator:
     renamed = from_authors_names({str(name): value for name, value in state.items()})
     first = renamed.get("encoder.0.weight")
     width = int(first.shape[0]) if first is not None and first.ndim == 4 else PAPER_GENERATOR.width
-    network = _without_weights(path, {"width": width})
+    network = _without_weights(path, "generator", {"width": width})
     expected = {name: tuple(tensor.shape) for name, tensor in network.state_dict().items()}
     _check_shapes(path, expected, {name: tuple(tensor.shape) for name, tensor in renamed.items()})
     network.load_state_dict({name: value.float() for name, value in renamed.items()}, assign=True)
     return network
 
 
-def _without_weights(path: Path, architecture: dict[str, Any]) -> Generator:
+def _without_weights(path: Path, kind: str, architecture: Mapping[str, Any]) -> Network:
     try:
         with torch.device("meta"):
-            return Generator(GeneratorConfig(**architecture))
+            return build(find_config(kind)(**architecture))
     except (RuntimeError, TypeError, ValueError):
         raise CheckpointError(
-            f"{path}: another architecture, no generator can be built as {architecture}; "
+            f"{path}: another architecture, no {kind} can be built as {architecture}; "
             "load it with its own code"
         ) from None
 

@@ -17,7 +17,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from nets.generator import Generator
+from nets.architectures import Network
 from nets.training import Alone, BatchSource, Objective, Phase, Team, Terms, TrainerConfig
 
 
@@ -29,7 +29,7 @@ class Trainer:
     uninterrupted one would, and which process draws it does not matter.
     """
 
-    network: Generator
+    network: Network
     source: BatchSource
     objective: Objective
     config: TrainerConfig

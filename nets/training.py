@@ -16,7 +16,6 @@ from torch import Tensor, nn
 
 from nets.color import to_network_input
 from nets.data.pairs import PairBatch
-from nets.generator import Generator
 from nets.render import PointLight
 from nets.svbrdf import SVBRDF
 
@@ -56,7 +55,7 @@ class Losses:
     """What an objective says of one batch.
 
     Attributes:
-        generator: what the generator minimises.
+        generator: what the network minimises.
         terms: its parts, to log.
         critics: what the critics minimise; None without critics. Both losses may share one graph: each
             player's gradient is taken with respect to its own weights only.
@@ -67,8 +66,8 @@ class Losses:
     critics: Tensor | None = None
 
 
-Objective = Callable[[Generator, nn.ModuleDict, TrainingBatch, torch.Generator], Losses]
-"""`(generator network, critics by name, batch, random numbers) -> losses`."""
+Objective = Callable[[Any, nn.ModuleDict, TrainingBatch, torch.Generator], Losses]
+"""`(a network it is made for, critics by name, batch, random numbers) -> losses`."""
 
 BatchSource = Callable[[int, int, torch.Generator], TrainingBatch]
 """`(batch size, crop in pixels, random numbers) -> batch`."""

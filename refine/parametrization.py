@@ -62,6 +62,10 @@ class Parameters:
             _from_logit(self.specular, ALBEDO_RANGE),
         )
 
+    def detach(self) -> Parameters:
+        """Drop the autograd graph of all tensors."""
+        return Parameters(*(getattr(self, name).detach() for name in MAPS))
+
     def shifted(self, offsets: dict[str, Tensor]) -> Parameters:
         """Add offsets to some maps, by name; they broadcast over pixels or not."""
         return Parameters(

@@ -26,6 +26,7 @@ from refine.capture import Capture
 from refine.engine import choose_engine
 from refine.errors import UserError
 from refine.initialization import Predict, Predictor, initialize
+from refine.latent import require_weights
 from refine.light import FalloffChoice, check_falloff, fit_light, fit_light_and_falloff
 from refine.maps import MapFormat, NormalConvention, write_maps
 from refine.photo import ColorSpaceChoice, Photo, photo_from_array, read_photo, resize_photo
@@ -146,7 +147,8 @@ class Refiner:
             engine: a name in `refine.engine.ENGINES`; None takes the fastest for the device.
 
         Raises:
-            nets.checkpoint.CheckpointError: if a named checkpoint cannot be loaded.
+            nets.checkpoint.CheckpointError: if a named checkpoint, or the auto-encoder of a recipe, cannot be
+                loaded.
             ValueError: for an unknown recipe, or an engine that is not there for the device.
         """
         self.device = torch.device(device)
@@ -157,6 +159,7 @@ class Refiner:
             model = FlipAverage(network) if flips else network
         self.model = model
         self.recipe = find_recipe(recipe) if isinstance(recipe, str) else recipe
+        require_weights(self.recipe)
         self.camera = camera or Camera()
         self.camera_of_several = camera or Camera("collocated")
         self.resolution = resolution

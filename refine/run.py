@@ -10,8 +10,9 @@ from refine.bands import distance_in_bands
 from refine.capture import Capture
 from refine.engine import choose_engine, find_descend, find_solve
 from refine.engine.reference import Progress
+from refine.latent import descend_latent
 from refine.parametrization import Parameters
-from refine.stages import PosteriorStage, Recipe, Stage
+from refine.stages import LatentStage, PosteriorStage, Recipe, Stage
 
 Report = Callable[[str, int, int, float], None]
 """Progress: stage name, iteration (from 1), iterations of all stages, loss."""
@@ -91,6 +92,8 @@ def _run_stage(
             progress=tell,
         )
         return posterior.parameters, posterior.history
+    if isinstance(stage, LatentStage):
+        return descend_latent(start, photos, stage, engine, tell)
     height, width = start.normal.shape[-2:]
     offsets = {name: zero.to(start.normal.device) for name, zero in stage.offsets(height, width).items()}
     descended: tuple[Parameters, list[float]] = find_descend(engine)(

@@ -133,7 +133,38 @@ class PosteriorStage:
         return replace(self, iterations=iterations)
 
 
-Stage = GlobalStage | PixelStage | PosteriorStage
+@dataclass(frozen=True)
+class LatentStage:
+    """Move the latent code of an auto-encoder of materials, see `refine.latent` (Gao et al. 2019).
+
+    Attributes:
+        iterations: Adam steps.
+        rate: Adam's learning rate.
+        beta1: Adam's.
+        checkpoint: the auto-encoder: a shipped name, or a file.
+    """
+
+    iterations: int = 4000
+    rate: float = 1e-3
+    beta1: float = 0.5
+    checkpoint: str = "gao19"
+
+    @property
+    def name(self) -> str:
+        """How logs and files call this stage."""
+        return "latent"
+
+    @property
+    def moves(self) -> bool:
+        """Whether any map moves: all do."""
+        return True
+
+    def scaled(self, iterations: int, pace: float) -> LatentStage:
+        """Return this stage with other iterations, and the rate times a pace."""
+        return replace(self, iterations=iterations, rate=self.rate * pace)
+
+
+Stage = GlobalStage | PixelStage | PosteriorStage | LatentStage
 
 
 @dataclass(frozen=True)
@@ -197,15 +228,20 @@ MANY_PHOTOS = PosteriorStage(20, Widths(normal=0.14, diffuse=0.2, roughness=0.17
 """Of the recipe `several`: more photos do tell roughness, so its prior is as wide as errors were measured,
 and the way down is longer."""
 
+GAO_PIXELS = PixelStage(iterations=200)
+"""Of the recipe `gao+`: Gao19's 200 steps, at the rates of Ours+."""
+
 RECIPES: dict[str, Recipe] = {
     "default": Recipe("default", stages=(LONG_GLOBAL, PosteriorStage())),
     "paper": Recipe("paper", stages=(GlobalStage(), PixelStage())),
     "several": Recipe("several", stages=(LONG_GLOBAL, MANY_PHOTOS)),
     "fast": Recipe("fast", light_fit=None, stages=(PosteriorStage(iterations=3),)),
+    "gao": Recipe("gao", stages=(LatentStage(),)),
+    "gao+": Recipe("gao+", stages=(LatentStage(), GAO_PIXELS)),
 }
 """By name. `default` is the best there is for one photo, and `several` takes its place for more. `paper` is
 Ours+ of Table 1: global roughness and specular, then every map per pixel. `fast` believes the light head and
-takes three steps: real time."""
+takes three steps: real time. `gao` and `gao+` are Gao19 and Gao19+ of Table 1; they start from `des19`."""
 
 
 def find_recipe(name: str) -> Recipe:

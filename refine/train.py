@@ -12,6 +12,7 @@ import typer
 from losses.score import build_critics
 from losses.vgg_weights import load_vgg16
 from losses.with_vgg import give_vgg, needs_vgg
+from nets.architectures import build
 from nets.checkpoint import Record, save_model
 from nets.data.augment import Augmentation, augment
 from nets.data.images import DataError
@@ -19,7 +20,6 @@ from nets.data.materials import Materials, open_materials
 from nets.data.pairs import PhotoPairs
 from nets.data.photography import FlashPhotography
 from nets.data.pool import Part
-from nets.generator import Generator
 from nets.trainer import Trainer
 from nets.training import BatchSource, TrainingBatch
 from refine.team import FabricTeam, process_count
@@ -136,7 +136,7 @@ def train(
                 for part in PARTS
             )
             trainer = Trainer(
-                Generator(plan.generator),
+                build(one.network),
                 training,
                 objective,
                 replace(one.trainer, seed=seed),
@@ -220,25 +220,25 @@ def _check_shards(stages: list[Stage], processes: int) -> None:
 def _origin(
     stage: Stage, plan: TrainingPlan, chosen: list[Stage], out: Path, start: Path | None
 ) -> Path | None:
-    """Return the state whose networks a stage starts from; None for the plan's first.
+    """Return the state whose networks a stage starts from; None for the plan's first of their shape.
 
     It is that of the stage trained before it in this run; else `--start`; else that of the stage before it in
     the plan, from a run of before.
     """
-    earlier = chosen[: chosen.index(stage)]
+    earlier = [one for one in chosen[: chosen.index(stage)] if one.network == stage.network]
     if earlier:
         return out / earlier[-1].name / STATE
     if start is not None:
         if not start.is_file():
             raise PlanError(f"--start {start} is not a file")
         return start
-    number = plan.stages.index(stage)
-    if number == 0:
+    before = [one for one in plan.stages[: plan.stages.index(stage)] if one.network == stage.network]
+    if not before:
         return None
-    origin = out / plan.stages[number - 1].name / STATE
+    origin = out / before[-1].name / STATE
     if not (origin.is_file() or (out / stage.name / STATE).is_file()):
         raise PlanError(
-            f"stage {stage.name} starts from the networks of {plan.stages[number - 1].name}, but there is no "
+            f"stage {stage.name} starts from the networks of {before[-1].name}, but there is no "
             f"{origin}; train that first, or give a state with --start"
         )
     return origin

@@ -7,8 +7,10 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
+from losses.baselines import AutoencoderObjective, RenderingObjective
 from losses.objective import HybridObjective
 from losses.presets import AnyObjective, find_objective, override
+from nets.architectures import NetworkConfig, find_config, kind_of
 from nets.data.augment import Augmentation
 from nets.data.photography import FlashPhotography
 from nets.discriminator import DiscriminatorConfig
@@ -28,12 +30,14 @@ class Stage:
 
     Attributes:
         name: of its folder.
+        network: shape of what is trained.
         objective: what is minimised.
         trainer: phases, learning rates, seed.
         pairs: real pairs per shard.
     """
 
     name: str
+    network: NetworkConfig
     objective: AnyObjective
     trainer: TrainerConfig
     pairs: int = 0
@@ -44,16 +48,14 @@ class TrainingPlan:
     """Everything that is known before data are seen.
 
     Attributes:
-        generator: shape of the network.
         critics: shape of each critic: width, layers, scales.
-        stages: in order; each starts from the networks of the one before.
+        stages: in order; each starts from the networks of the last one of its shape before it.
         shares: how often each collection of a pool is drawn; empty draws every material alike.
         augmentation: how materials are varied.
         photography: how they are photographed.
         precision: `32-true` or `bf16-mixed`.
     """
 
-    generator: GeneratorConfig
     critics: Mapping[str, int]
     stages: tuple[Stage, ...]
     shares: Mapping[str, float] = field(default_factory=dict)
@@ -103,25 +105,20 @@ def plan_of(content: Any) -> TrainingPlan:
     Raises:
         ValueError: naming the entry that is missing, unknown or of the wrong kind.
     """
-    entries = _mapping(content, "the plan", required=("generator", "stages"), optional=OPTIONAL)
+    entries = _mapping(content, "the plan", required=("stages",), optional=OPTIONAL)
     critics = _mapping(entries.get("critics", {}), "critics", optional=("width", "layers", "scales"))
     _whole_numbers(critics, "critics")
     DiscriminatorConfig(**critics)  # refuses what cannot be built
-    generator = override(GeneratorConfig(), _mapping(entries["generator"], "generator"))
+    generator: NetworkConfig | None = None
+    if "generator" in entries:
+        generator = override(GeneratorConfig(), _mapping(entries["generator"], "generator"))
     common = _mapping(entries.get("trainer", {}), "trainer")
     if not isinstance(entries["stages"], list) or not entries["stages"]:
         raise ValueError("stages must be a list of at least one stage")
-    stages = tuple(_stage(stage, common) for stage in entries["stages"])
+    stages = tuple(_stage(stage, common, generator) for stage in entries["stages"])
     names = [stage.name for stage in stages]
     if len(set(names)) != len(names):
         raise ValueError(f"stages must have names of their own, got {', '.join(names)}")
-    for stage in stages:
-        for phase in stage.trainer.phases:
-            if phase.crop % generator.multiple:
-                raise ValueError(
-                    f"stage {stage.name} has a crop of {phase.crop} pixels; {generator.levels} levels need "
-                    f"multiples of {generator.multiple}"
-                )
     precision = entries.get("precision", "32-true")
     if precision not in PRECISIONS:
         raise ValueError(f"precision must be one of {', '.join(PRECISIONS)}, got {precision!r}")
@@ -130,7 +127,6 @@ def plan_of(content: Any) -> TrainingPlan:
         if not isinstance(share, int | float) or isinstance(share, bool) or not share > 0.0:
             raise ValueError(f"shares: {name} must be a number greater than 0, got {share!r}")
     return TrainingPlan(
-        generator=generator,
         critics=critics,
         stages=stages,
         shares={name: float(share) for name, share in shares.items()},
@@ -140,21 +136,35 @@ def plan_of(content: Any) -> TrainingPlan:
     )
 
 
-OPTIONAL = ("critics", "trainer", "shares", "augmentation", "photography", "precision")
+OPTIONAL = ("generator", "critics", "trainer", "shares", "augmentation", "photography", "precision")
 
 
-def _stage(content: Any, common: Mapping[str, Any]) -> Stage:
-    required, optional = ("name", "objective", "phases"), ("trainer", "pairs")
+def _stage(content: Any, common: Mapping[str, Any], generator: NetworkConfig | None) -> Stage:
+    required, optional = ("name", "objective", "phases"), ("network", "trainer", "pairs")
     entries = _mapping(content, "a stage", required=required, optional=optional)
     name = str(entries["name"])
     where = f"stage {name}"
     if name in ("", ".", "..") or Path(name).name != name:
         raise ValueError(f"a stage's name is that of its folder, got {name!r}")
+    network = _network(entries["network"], f"{where}: network") if "network" in entries else generator
+    if network is None:
+        raise ValueError(f"{where} lacks network, and the plan generator")
     wanted = dict(_mapping(entries["objective"], f"{where}: objective", required=("kind",)))
     objective = find_objective(str(wanted.pop("kind")), str(wanted.pop("preset", "paper")), wanted)
+    if kind_of(network) not in _kinds_for(objective):
+        raise ValueError(
+            f"{where} trains a network of kind {kind_of(network)} on an objective for "
+            f"{' or '.join(_kinds_for(objective))}"
+        )
     if not isinstance(entries["phases"], list) or not entries["phases"]:
         raise ValueError(f"{where}: phases must be a list of at least one phase")
     phases = tuple(_phase(phase, where) for phase in entries["phases"])
+    for phase in phases:
+        if phase.crop % network.multiple:
+            raise ValueError(
+                f"{where} has a crop of {phase.crop} pixels; its network needs multiples of "
+                f"{network.multiple}"
+            )
     changes = {**common, **_mapping(entries.get("trainer", {}), f"{where}: trainer")}
     for elsewhere, place in (("phases", "of the stage"), ("seed", "an option of refine-train")):
         if elsewhere in changes:
@@ -163,7 +173,24 @@ def _stage(content: Any, common: Mapping[str, Any]) -> Stage:
     pairs = entries.get("pairs", 0)
     if type(pairs) is not int or pairs < 0 or bool(pairs) != isinstance(objective, HybridObjective):
         raise ValueError(f"{where}: pairs must be at least 1 with a hybrid objective and 0 with others")
-    return Stage(name, objective, trainer, pairs)
+    return Stage(name, network, objective, trainer, pairs)
+
+
+def _network(content: Any, where: str) -> NetworkConfig:
+    values = dict(_mapping(content, where, required=("kind",)))
+    shape = find_config(str(values.pop("kind")))
+    return override(shape(), values)
+
+
+def _kinds_for(objective: AnyObjective) -> tuple[str, ...]:
+    """Return the kinds of networks that an objective can be asked of."""
+    match objective:
+        case AutoencoderObjective():
+            return ("autoencoder",)
+        case RenderingObjective():
+            return ("des18", "des19")
+        case _:
+            return ("generator",)
 
 
 def _phase(content: Any, where: str) -> Phase:

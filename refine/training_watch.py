@@ -10,12 +10,14 @@ from typing import Any
 import numpy as np
 import torch
 
+from nets.architectures import Network
+from nets.baselines.autoencoder import Autoencoder
 from nets.color import gamma_encode
 from nets.data.contact_sheet import panels
 from nets.data.images import write_image
 from nets.svbrdf import SVBRDF
 from nets.trainer import Trainer, stream_seed
-from nets.training import BatchSource
+from nets.training import BatchSource, TrainingBatch
 
 VALIDATION_SHARDS = 4
 """Batches of held-out data that figures are averaged over."""
@@ -78,7 +80,7 @@ class Watch:
     def _sheet(self, trainer: Trainer, crop: int) -> None:
         generator = torch.Generator().manual_seed(stream_seed(0, 0, VALIDATION_SHARDS))
         batch = self.validation(SHEET_MATERIALS, crop, generator)
-        estimate, _ = trainer.average.predict(batch.photo)
+        estimate = _estimate(trainer.average, batch)
         rows = []
         for number in range(SHEET_MATERIALS):
             photo = gamma_encode(batch.photo[number]).permute(1, 2, 0)
@@ -96,6 +98,12 @@ class Watch:
     def close(self) -> None:
         """Flush TensorBoard."""
         self.board.close()
+
+
+def _estimate(network: Network, batch: TrainingBatch) -> SVBRDF:
+    if isinstance(network, Autoencoder):
+        return network.reconstruct(batch.truth)
+    return network.predict(batch.photo)[0]
 
 
 def _rounded(values: dict[str, float]) -> dict[str, float]:

@@ -60,6 +60,13 @@ def find_descend(name: str) -> Callable[..., Any]:
     return descend
 
 
+def find_gradients(name: str) -> Callable[..., Any]:
+    """Return the `distance_and_gradients` that goes with an engine, see `refine.engine.reference`."""
+    module = ENGINES["fused" if name == "fused" else "reference"]
+    gradients: Callable[..., Any] = import_module(module).distance_and_gradients
+    return gradients
+
+
 def find_solve(name: str) -> Callable[..., Any]:
     """Return the `solve` that goes with an engine, see `refine.engine.gauss_newton.solve`."""
     module = "fused_gauss_newton" if name == "fused" else "gauss_newton"

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Bool, Float
@@ -12,6 +12,7 @@ from torch import Tensor
 
 from losses.refinement import photo_distance
 from nets.render import PAPER, Conventions, Geometry, shade
+from nets.svbrdf import MAPS
 from refine.bands import photo_geometry
 from refine.capture import Capture
 from refine.parametrization import Parameters
@@ -85,6 +86,28 @@ def descend(
     with torch.no_grad():
         keep(float(objective.distance(moving)))
     return objective.moved(best), history
+
+
+def distance_and_gradients(
+    start: Parameters,
+    capture: Capture | Sequence[Capture],
+    geometry: Geometry | Sequence[Geometry] | None = None,
+    conventions: Conventions = PAPER,
+) -> tuple[float, dict[str, Float[Tensor, "1 c h w"]]]:
+    """Return the distance, and by map name the gradient of every pixel's own distance by its parameters.
+
+    Args:
+        start: the parameters.
+        capture: as in `descend`.
+        geometry: as there.
+        conventions: as there.
+    """
+    zeros = {name: torch.zeros_like(getattr(start, name)).requires_grad_(True) for name in MAPS}
+    objective = Objective.of(start, zeros, capture, geometry, conventions)
+    # Clipped pixels say how their parameters should move, too.
+    distance = replace(objective, moves=torch.ones_like(objective.moves)).distance(zeros)
+    gradients = torch.autograd.grad(distance * objective.own_pixels, [zeros[name] for name in MAPS])
+    return float(distance.detach()), dict(zip(MAPS, gradients, strict=True))
 
 
 def share_of_rate(step: int, iterations: int) -> float:

@@ -342,12 +342,12 @@ SPOILED = [
     (_deeper, r"another architecture, \S+ is missing"),
     (_missing, r"another architecture, encoder_norms\.0\.bias is missing"),
     (_unknown, r"another architecture, zz\.top is unknown here"),
-    (_impossible, "not a generator of this library"),
-    (_not_a_number, "not a generator of this library"),
+    (_impossible, "not a network of this library"),
+    (_not_a_number, "not a network of this library"),
     (_enormous, "another architecture, no generator can be built"),
-    (_unknown_option, "not a generator of this library"),
-    (_other_format, "not a generator of this library"),
-    (_no_architecture, "not a generator of this library"),
+    (_unknown_option, "not a network of this library"),
+    (_other_format, "not a network of this library"),
+    (_no_architecture, "not a network of this library"),
 ]
 
 
@@ -367,12 +367,12 @@ def test_spoiled_files_of_ours_are_refused(saved: Path, change, message: str) ->
 @pytest.mark.parametrize(
     ("metadata", "message"),
     [
-        (None, "not a generator of this library"),
-        ({"other": "{}"}, "not a generator of this library"),
-        ({HEADER_KEY: "no json"}, "not a generator of this library"),
-        ({HEADER_KEY: "[]"}, "not a generator of this library"),
-        ({HEADER_KEY: '"text"'}, "not a generator of this library"),
-        ({HEADER_KEY: "null"}, "not a generator of this library"),
+        (None, "not a network of this library"),
+        ({"other": "{}"}, "not a network of this library"),
+        ({HEADER_KEY: "no json"}, "not a network of this library"),
+        ({HEADER_KEY: "[]"}, "not a network of this library"),
+        ({HEADER_KEY: '"text"'}, "not a network of this library"),
+        ({HEADER_KEY: "null"}, "not a network of this library"),
     ],
 )
 def test_files_without_our_header_are_refused(saved: Path, metadata, message: str) -> None:  # type: ignore[no-untyped-def]
