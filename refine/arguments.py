@@ -75,7 +75,7 @@ def require_device(name: str) -> None:
 def require_sense(
     photos: Sequence[Path], *, one_surface: bool, light: str, align: bool, lights: Path | None
 ) -> None:
-    """Check that what is said of several photos is said of several photos.
+    """Check that what is said of several photos of one surface is said of such photos.
 
     Raises:
         UserError: options that do not go together.
@@ -84,9 +84,42 @@ def require_sense(
         raise UserError("--one-surface needs two or more photos; give more, or leave it out.")
     if one_surface and light != "estimated":
         raise UserError("--light is of one photo; give the positions of several in a file with --lights.")
-    if not one_surface and len(photos) > 1:
-        raise UserError(f"{photos[1]} is a photo too many; say --one-surface if all show one surface.")
     if not one_surface and (align or lights is not None):
         raise UserError("--align and --lights are for several photos; say --one-surface, too.")
     if align and lights is not None:
         raise UserError("--lights are known of photos in register; leave out --align or --lights.")
+
+
+def require_batch_sense(
+    photos: Sequence[Path],
+    *,
+    batch: bool,
+    out: Path | None,
+    engine: str,
+    scheduler: str | None,
+    workers: int | None,
+) -> None:
+    """Check what is said of a batch, and that several photos are meant to be one.
+
+    Args:
+        photos: as given, folders included.
+        batch: whether every photo gets a material of its own, in a folder of its own.
+        out: folder of the results.
+        engine: `dask` is where a batch runs, not how a photo is refined.
+        scheduler: address of a cluster's.
+        workers: how many processes.
+
+    Raises:
+        UserError: options that do not go together.
+    """
+    if not batch and (engine == "dask" or scheduler is not None or workers is not None):
+        raise UserError("--workers, --scheduler and --engine dask are for batches; give a folder of photos.")
+    if batch and out is None and len(photos) > 1:
+        raise UserError(
+            f"There is more than one photo, {photos[1]} is the second; say --out DIR for a material of each, "
+            "or --one-surface if all show one surface."
+        )
+    if (engine == "dask") != (scheduler is not None):
+        raise UserError("--engine dask and --scheduler ADDRESS go together; give both or neither.")
+    if scheduler is not None and workers is not None:
+        raise UserError("--workers are of this machine, a cluster has its own; leave out --workers.")

@@ -13,22 +13,32 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from importlib import import_module
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal, cast, get_args
+from typing import Annotated, Any, get_args
 
 import typer
 
 from refine import __version__
-from refine.arguments import choose, parse_camera, parse_point, require_device, require_sense
+from refine.arguments import (
+    choose,
+    parse_camera,
+    parse_point,
+    require_batch_sense,
+    require_device,
+    require_sense,
+)
+from refine.batch.plan import find_photos
 from refine.console import progress_bar, summarise
 from refine.errors import UserError
 from refine.export.targets import parse_targets
-
-if TYPE_CHECKING:
-    from nets.render import PointLight
+from refine.request import ESTIMATED, Request, enough_memory
 
 USER_ERROR, INTERRUPTED = 2, 130
 
-SUBCOMMANDS: dict[str, str] = {"export": "refine.export.cli:app", "view": "refine.viewer.cli:app"}
+SUBCOMMANDS: dict[str, str] = {
+    "export": "refine.export.cli:app",
+    "view": "refine.viewer.cli:app",
+    "video": "refine.video.cli:app",
+}
 """Commands besides the default one, as `name: "module:typer_app"`; imported only when asked for."""
 
 QUICK_ITERATIONS = 50
@@ -66,9 +76,10 @@ def _version(asked: bool) -> bool:
 @app.command()
 def fit(
     photos: Annotated[
-        list[Path], typer.Argument(metavar="PHOTO", help="JPEG, PNG, TIFF, EXR", show_default=False)
+        list[Path],
+        typer.Argument(metavar="PHOTO", help="JPEG, PNG, TIFF, EXR; or a folder", show_default=False),
     ],
-    light: Annotated[str, _surface("X,Y,Z", "Position of the flash (estimated)")] = "estimated",
+    light: Annotated[str, _surface("X,Y,Z", "Position of the flash (estimated)")] = ESTIMATED,
     falloff: Annotated[str | None, _surface("NAME", "(none), inverse_square, auto")] = None,
     camera: Annotated[str | None, _surface("NAME", "(perspective), orthographic, collocated, X,Y,Z")] = None,
     color_space: Annotated[
@@ -89,7 +100,7 @@ def fit(
         bool,
         _switch("--quick", help=f"--iters {QUICK_ITERATIONS} --no-report", panel="Refinement"),
     ] = False,
-    engine: Annotated[str, _refinement("NAME", "(auto), fused, compiled, reference")] = "auto",
+    engine: Annotated[str, _refinement("NAME", "(auto), fused, compiled, reference; dask")] = "auto",
     seed: Annotated[int, _refinement("N", "Same seed, same bytes (0)")] = 0,
     out: Annotated[Path | None, _output("DIR", "Folder (./<photo>_material)")] = None,
     format: Annotated[str, _output("NAME", "(png), png8, tif, tif8, tif32, exr, exr32")] = "png",
@@ -98,37 +109,41 @@ def fit(
         bool, _switch("--uncertainty", help="Say how well each pixel is known, too", panel="Output")
     ] = False,
     no_report: Annotated[bool, _switch("--no-report", help="No <photo>_report.png", panel="Output")] = False,
-    export: Annotated[
-        str | None, _output("NAME,NAME", "For other programs, too: see refine export --help")
-    ] = None,
+    export: Annotated[str | None, _output("NAME,NAME", "For other programs: see refine export")] = None,
     as_json: Annotated[bool, _switch("--json", help="Print the JSON record, too", panel="Output")] = False,
     quiet: Annotated[bool, _switch("--quiet", "-q", help="Print nothing but errors")] = False,
     device: Annotated[str, _option("NAME", "(cpu), cuda, cuda:1, mps", None)] = "cpu",
-    threads: Annotated[int | None, _option("N", "CPU threads (one per core)", None)] = None,
+    threads: Annotated[int | None, _option("N", "CPU threads (one per core; 1 in batches)", None)] = None,
+    workers: Annotated[int | None, _option("N", "Of a batch: processes (one per core)", None)] = None,
+    scheduler: Annotated[str | None, _option("ADDRESS", "Of a batch with --engine dask", None)] = None,
     version: Annotated[
         bool, _switch("--version", help="Print the version", callback=_version, is_eager=True)
     ] = False,
 ) -> None:
     """Turn flash photos of a flat surface into a relightable material.
 
-    Writes <photo>_normal.png, four more images, <photo>.json and a report.
+    Writes <photo>_normal.png, four more images, <photo>.json and a report;
+    of a folder, or with --out of several photos, for each, and an index.
     Defaults are in parentheses; --one-surface is collocated, inverse_square.
+    More commands: refine export, view, video; each has --help.
     """
-    photo = photos[0]
+    given, folders = photos, any(photo.is_dir() for photo in photos)
+    batch = not one_surface and (folders or len(photos) > 1)
+    require_batch_sense(given, batch=batch, out=out, engine=engine, scheduler=scheduler, workers=workers)
+    if folders or batch:
+        photos = find_photos(photos)
     require_sense(photos, one_surface=one_surface, light=light, align=align, lights=lights)
     camera = camera or ("collocated" if one_surface else "perspective")
     falloff = falloff or ("inverse_square" if one_surface else "none")
-    position = (
-        None
-        if light == "estimated"
-        else parse_point("--light", light, "or leave it out to have it estimated")
-    )
-    kind, viewpoint = parse_camera(camera)
+    if light != ESTIMATED:
+        parse_point("--light", light, "or leave it out to have it estimated")
+    parse_camera(camera)
     choose("--falloff", falloff, ("none", "inverse_square", "auto"))
-    if falloff == "auto" and (position is not None or lights is not None):
+    if falloff == "auto" and (light != ESTIMATED or lights is not None):
         raise UserError("--falloff auto needs a light to fit; leave out --light(s) or name the falloff.")
     choose("--normals", normals, ("opengl", "directx"))
-    for name, number, lowest in (("iters", iters, 0), ("resolution", resolution, 0), ("threads", threads, 1)):
+    numbers = (("iters", iters, 0), ("resolution", resolution, 0), ("threads", threads, 1))
+    for name, number, lowest in (*numbers, ("workers", workers, 1)):
         if number is not None and not lowest <= number < 2**31:
             raise UserError(f"--{name} {number} is out of range; give {lowest} or more.")
     if not 0 <= seed < 2**63:
@@ -136,18 +151,16 @@ def fit(
     if quick:
         iters = QUICK_ITERATIONS if iters is None else iters
         no_report = True
+    if engine == "dask":
+        engine = "auto"
     targets = parse_targets("--export", export) if export is not None else []
 
     import torch
 
-    from nets.render import Camera, PointLight
     from refine.engine import ENGINES, obstacle
     from refine.export.cli import export_folder
-    from refine.known_lights import read_lights
-    from refine.light import FalloffChoice
-    from refine.photo import ColorSpaceChoice, read_photo
-    from refine.refiner import Refiner
-    from refine.result import MAP_FORMATS, Output, describe, describe_checkpoint, write_result
+    from refine.photo import ColorSpaceChoice
+    from refine.result import MAP_FORMATS, describe, describe_checkpoint, write_result
     from refine.stages import RECIPES
 
     choose("--color-space", color_space, get_args(ColorSpaceChoice))
@@ -159,65 +172,47 @@ def fit(
         raise UserError(f"--engine {engine} cannot be used: {reason}; leave --engine or --device out.")
     if threads is not None:
         torch.set_num_threads(threads)
-    reads = [read_photo(path, color_space=cast(ColorSpaceChoice, color_space)) for path in photos]
-    output = Output(
-        out if out is not None else Path(f"{photo.stem}_material"),
-        photo.stem,
-        format,
-        cast(Literal["opengl", "directx"], normals),
+    request = Request(
+        init=init,
+        recipe=recipe,
+        iters=iters,
+        engine=engine,
+        resolution=resolution,
+        light=light,
+        one_surface=one_surface,
+        align=align,
+        lights=lights,
+        falloff=falloff,
+        camera=camera,
+        color_space=color_space,
+        normals=normals,
+        format=format,
+        device=device,
+        seed=seed,
+        threads=(threads or 1) if batch else torch.get_num_threads(),
         report=not no_report,
         uncertainty=uncertainty,
+        thumbnail=batch,
+        export=tuple(targets),
     )
+    if batch:
+        from refine.batch.run import refine_batch
+
+        folder = out if out is not None else Path(f"{given[0].resolve().name}_materials")
+        refine_batch(
+            request, photos, folder, workers=workers, scheduler=scheduler, quiet=quiet, as_json=as_json
+        )
+        return
+    reads = [request.read(path) for path in photos]
+    output = request.output(out or Path(f"{photos[0].stem}_material"), photos[0].stem)
     for path in photos:
         output.require_writable(path)
     checkpoint = describe_checkpoint(init)
-    seen_from = Camera(kind) if viewpoint is None else Camera(kind, viewpoint)
-    refiner = Refiner(
-        init,
-        recipe,
-        camera=seen_from,
-        resolution=resolution or None,
-        seed=seed,
-        device=device,
-        engine=None if engine == "auto" else engine,
-    )
-    flash: PointLight | None = None
-    known_falloff = cast(Literal["none", "inverse_square"], falloff)
-    if position is not None:
-        flash = PointLight.at(position, falloff=known_falloff).to(device)
-    elif lights is not None:
-        flash = read_lights(lights, photos, known_falloff)
-
-    settings = {
-        "init": init,
-        "recipe": recipe,
-        "iters": iters,
-        "engine": engine,
-        "resolution": resolution,
-        "light": light,
-        "one_surface": one_surface,
-        "align": align,
-        "lights": None if lights is None else lights.name,
-        "falloff": falloff,
-        "camera": camera,
-        "color_space": color_space,
-        "normals": normals,
-        "format": format,
-        "device": device,
-        "seed": seed,
-        "threads": torch.get_num_threads(),
-    }
-    with progress_bar(shown=not quiet and sys.stderr.isatty()) as progress, _enough_memory(), _log(quiet):
-        unknown_falloff = None if flash else cast(FalloffChoice, falloff)
-        if one_surface:
-            refined = refiner.fit_many(
-                reads, lights=flash, falloff=unknown_falloff, align=align, iters=iters, progress=progress
-            )
-        else:
-            refined = refiner.fit(
-                reads[0], light=flash, falloff=unknown_falloff, iters=iters, progress=progress
-            )
-        record = describe(refined, output, settings=settings, checkpoint=checkpoint, photo=reads[0])
+    refiner = request.refiner()
+    flash = request.flash(photos)
+    with progress_bar(shown=not quiet and sys.stderr.isatty()) as progress, enough_memory(), _log(quiet):
+        refined = request.fit(refiner, reads, flash, progress)
+        record = describe(refined, output, settings=request.settings(), checkpoint=checkpoint, photo=reads[0])
         paths = write_result(refined, output, record)
     if as_json:
         json.dump({**record, "folder": str(output.folder)}, sys.stdout, indent=2)
@@ -240,19 +235,6 @@ def _log(quiet: bool) -> Iterator[None]:
         log.setLevel(level)
 
 
-@contextmanager
-def _enough_memory() -> Iterator[None]:
-    try:
-        yield
-    except (MemoryError, RuntimeError) as error:
-        text = str(error).lower()
-        if isinstance(error, MemoryError) or "out of memory" in text or "can't allocate memory" in text:
-            raise UserError(
-                "There is not enough memory for this size; ask for a lower --resolution."
-            ) from None
-        raise
-
-
 def run(arguments: Sequence[str]) -> int:
     """Run the command line and return its exit code; the sentence about an error goes to standard error."""
     arguments = list(arguments)
@@ -268,7 +250,7 @@ def run(arguments: Sequence[str]) -> int:
         if (sentence := _sentence(error, name)) is None:
             raise
         print(f"refine: {sentence}", file=sys.stderr)
-        return USER_ERROR
+        return int(getattr(error, "code", USER_ERROR))
     if code == INTERRUPTED:
         print("refine: interrupted; nothing was written.", file=sys.stderr)
     return int(code)

@@ -39,6 +39,7 @@ from refine.maps import (
 from refine.photo import Photo
 from refine.refiner import Refined
 from refine.report.sheet import write_sheet
+from refine.report.thumbnail import write_thumbnail
 
 FORMAT = "svbrdf-refine result 1"
 
@@ -68,6 +69,7 @@ class Output:
         normals: what the green channel of the normal file means.
         report: whether `<stem>_report.png` is written.
         uncertainty: whether `<stem>_normal_deviation` and so on are written, and drawn in the report.
+        thumbnail: whether `<stem>_thumbnail.jpg` is written, for an index of many results.
     """
 
     folder: Path
@@ -76,19 +78,24 @@ class Output:
     normals: NormalConvention = "opengl"
     report: bool = True
     uncertainty: bool = False
+    thumbnail: bool = False
 
     def paths(self) -> dict[str, Path]:
-        """Return every file of the result: maps and deviations by name, `rendering`, `json`, `report`."""
+        """Return every file of the result: maps and deviations by name, `rendering`, `report`, `json`.
+
+        The record comes last, as `write_together` has it: where it is, the others are of the same run.
+        """
         format = MAP_FORMATS[self.format]
         paths = map_paths(self.folder, self.stem, format=format)
         if self.uncertainty:
             for name in MAP_NAMES:
                 key = _deviation(name)
                 paths[key] = self.folder / f"{self.stem}_{key}.{format.extension}"
-        paths["json"] = self.folder / f"{self.stem}.json"
         if self.report:
             paths["report"] = self.folder / f"{self.stem}_report.png"
-        return paths
+        if self.thumbnail:
+            paths["thumbnail"] = self.folder / f"{self.stem}_thumbnail.jpg"
+        return paths | {"json": self.folder / f"{self.stem}.json"}
 
     def require_writable(self, photo: Path) -> None:
         """Find out before the work, not after it, whether the files can be written; leaves nothing behind.
@@ -155,6 +162,8 @@ def write_result(refined: Refined, output: Output, record: dict[str, Any]) -> di
         temporaries["json"].write_text(to_json(record), encoding="utf-8", newline="\n")
         if output.report:
             write_sheet(temporaries["report"], refined, uncertainty=output.uncertainty)
+        if output.thumbnail:
+            write_thumbnail(temporaries["thumbnail"], refined)
     for name in outdated:
         (output.folder / name).unlink(missing_ok=True)
     return paths
@@ -203,7 +212,7 @@ def describe(
         "format": FORMAT,
         "photo": {
             "source": photo.source,
-            "sha256": _sha256(Path(photo.source)) if photo.source != "array" else None,
+            "sha256": digest(Path(photo.source)) if photo.source != "array" else None,
             "width": photo.size[1],
             "height": photo.size[0],
             "saturated": 1.0 - float(photo.unsaturated.double().mean()),
@@ -249,7 +258,7 @@ def _other(refined: Refined, capture: Capture) -> dict[str, Any]:
     )
     return {
         "source": capture.source,
-        "sha256": _sha256(Path(capture.source)) if capture.source != "array" else None,
+        "sha256": digest(Path(capture.source)) if capture.source != "array" else None,
         "notes": list(capture.notes),
         "light": _light(capture.light),
         "rmse": {"initialization": before, "refined": after},
@@ -287,7 +296,7 @@ def describe_checkpoint(name: str | Path) -> dict[str, Any]:
     """
     path = resolve(name)
     record = asdict(read_record(name)) if path.suffix == ".safetensors" else None
-    return {"name": str(name), "sha256": _sha256(path), "record": record}
+    return {"name": str(name), "sha256": digest(path), "record": record}
 
 
 def versions() -> dict[str, str]:
@@ -323,6 +332,7 @@ def _loss(values: list[float]) -> dict[str, Any]:
     }
 
 
-def _sha256(path: Path) -> str:
+def digest(path: Path) -> str:
+    """Return the SHA-256 of a file's content, in hexadecimal."""
     with path.open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()

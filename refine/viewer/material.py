@@ -17,14 +17,13 @@ import numpy as np
 import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor
-from torch.nn.functional import interpolate, normalize
 
 from nets.color import linear_to_srgb
-from nets.svbrdf import SVBRDF
 from refine.errors import UserError
 from refine.export.source import Result, read_result
 from refine.maps import MAP_NAMES, MapFormat, write_image
 from refine.photo import ColorSpaceChoice, read_photo, resize_photo
+from refine.shrinking import shrink, within
 
 LONGEST_SIDE = 1024
 """Longer side of the maps in a page, in pixels: 28 MB of text at most for the maps of a material."""
@@ -37,7 +36,7 @@ def describe_material(folder: Path, stem: str) -> dict[str, Any]:
         UserError: the result cannot be read, or its record is damaged.
     """
     result = read_result(folder, stem)
-    svbrdf = _shrink(result.svbrdf, LONGEST_SIDE)
+    svbrdf = shrink(result.svbrdf, *within(result.svbrdf.size, LONGEST_SIDE))
     height, width = svbrdf.size
     try:
         light, camera, record = result.record["light"], result.record["camera"], result.record
@@ -80,19 +79,6 @@ def _one_of(value: Any, known: tuple[str, ...]) -> str:
     if value not in known:
         raise ValueError(f"{value!r} is unknown")
     return str(value)
-
-
-def _shrink(svbrdf: SVBRDF, longest: int) -> SVBRDF:
-    """Average pixels until the longer side is `longest`; smaller maps are returned as they are."""
-    height, width = svbrdf.size
-    scale = longest / max(height, width)
-    if scale >= 1.0:
-        return svbrdf
-    size = (max(1, round(height * scale)), max(1, round(width * scale)))
-    shrunk = svbrdf.map(lambda tensor: interpolate(tensor, size=size, mode="area"))
-    return SVBRDF(
-        normalize(shrunk.normal, dim=1), shrunk.diffuse, shrunk.roughness, shrunk.specular
-    ).validate()
 
 
 def _encoded(name: str, tensor: Tensor) -> Float[np.ndarray, "h w channels"]:

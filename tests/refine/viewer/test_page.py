@@ -20,8 +20,9 @@ from nets.svbrdf import SVBRDF
 from refine.errors import UserError
 from refine.files import decode_image
 from refine.maps import MAP_NAMES
+from refine.shrinking import shrink, within
 from refine.viewer import build_page
-from refine.viewer.material import LONGEST_SIDE, _shrink
+from refine.viewer.material import LONGEST_SIDE
 
 from .conftest import HEIGHT, WIDTH, WriteResult
 
@@ -232,7 +233,7 @@ def test_large_maps_are_averaged_to_legal_ones() -> None:
         roughness=torch.full((1, 1, height, width), 0.4),
         specular=torch.full((1, 3, height, width), 0.1),
     )
-    shrunk = _shrink(large, LONGEST_SIDE)
+    shrunk = shrink(large, *within(large.size, LONGEST_SIDE))
     assert shrunk.size == (20, LONGEST_SIDE)
     assert (shrunk.normal - large.normal[..., :20, :LONGEST_SIDE]).abs().max() < 1e-6
     assert (shrunk.diffuse[0, 0, 0, 0] - 0.5 / (width - 1)).abs() < 1e-6
