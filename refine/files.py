@@ -9,26 +9,18 @@ import contextlib
 import os
 import secrets
 import stat
-import threading
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-import OpenImageIO as oiio
-from jaxtyping import Float32
+from jaxtyping import Float32, Shaped
 
+from nets import decoding
+from nets.decoding import Decoded, DecodingError, Limits
+from nets.text import printable
 from refine.errors import UserError
-
-MAXIMUM_SIDE = 32768
-"""Longest side of an image, in pixels, that is decoded."""
-
-MAXIMUM_PIXELS = 400_000_000
-"""Most pixels of an image that are decoded (4.8 GB as three float32 channels)."""
-
-_STANDARD_ERROR = threading.Lock()
 
 
 @dataclass(frozen=True)
@@ -36,69 +28,87 @@ class DecodedImage:
     """The first image of a file, upright, its values as stored.
 
     Attributes:
-        pixels: values as stored, row 0 at the top; integer formats are divided by their maximum.
-        spec: the OpenImageIO header: original format, channel names, metadata.
+        stored: values as stored, row 0 at the top.
+        file: what the file says of itself, its own pixels apart.
         notes: in plain words, what is unusual about the file and whether it was turned.
     """
 
-    pixels: Float32[np.ndarray, "h w channels"]
-    spec: Any
+    stored: Shaped[np.ndarray, "h w channels"]
+    file: Decoded
     notes: tuple[str, ...]
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Height and width."""
+        return self.stored.shape[0], self.stored.shape[1]
 
     @property
     def integer(self) -> bool:
         """Whether the file stores integers, so that its maximum is a clipping point."""
-        return str(self.spec.format) not in ("half", "float", "double")
+        return self.file.integer
+
+    @property
+    def pixels(self) -> Float32[np.ndarray, "h w channels"]:
+        """All of them, integers divided by their maximum."""
+        return self.rows(slice(None))
+
+    def rows(self, rows: slice) -> Float32[np.ndarray, "rows w channels"]:
+        """Return some rows, integers divided by their maximum."""
+        stored = self.stored[rows]
+        values = stored.astype(np.float32)
+        return values / np.float32(np.iinfo(stored.dtype).max) if stored.dtype.kind == "u" else values
 
 
-def decode_image(path: Path | str) -> DecodedImage:
+def decode_image(path: Path | str, limits: Limits | None = None) -> DecodedImage:
     """Decode an image file, whatever its extension says, without interpreting its colours.
 
     The EXIF orientation is applied. Colours are not multiplied by alpha where the file keeps them apart.
+    The file is read in another process (`nets.decoding`), so that no file can take this one down.
 
     Raises:
         UserError: the path is missing, not a regular file, empty, unreadable, not an image,
-            damaged, cut short, a volume, or larger than `MAXIMUM_SIDE` or `MAXIMUM_PIXELS`.
+            damaged, cut short, a volume, or takes more than the limits allow.
     """
-    path = Path(path)
+    path, limits = Path(path), limits or Limits()
     _require_regular_file(path)
-    wanted = oiio.ImageSpec()
-    wanted.attribute("oiio:UnassociatedAlpha", 1)
     try:
-        opened = oiio.ImageInput.open(str(path), wanted)
-    except UnicodeEncodeError as error:
-        raise UserError(f"The name of {str(path)!r} is not valid text; rename the file.") from error
-    if opened is None:
-        message = oiio.geterror()
-        if "limits:" in message:
-            raise UserError(
-                f"{path} is too large to decode; shrink it to at most {MAXIMUM_SIDE} pixels a side."
-            )
-        raise UserError(
-            f"{path} is not an image that can be read ({_one_line(message)}); "
-            "give a JPEG, PNG, TIFF, EXR or HDR file."
-        )
-    try:
-        spec = opened.spec()
-        _require_reasonable_size(path, spec)
-        with _without_library_messages() if opened.format_name() == "png" else contextlib.nullcontext():
-            pixels = opened.read_image(0, 0, 0, spec.nchannels, "float")
-        if pixels is None or opened.has_error:
-            reason = _one_line(opened.geterror()) or "the pixels could not be decoded"
-            raise UserError(f"{path} is damaged or cut short ({reason}); copy or export it again.")
-    finally:
-        opened.close()
-    notes = _peculiarities(spec)
-    pixels = pixels.reshape(spec.height, spec.width, spec.nchannels)
-    orientation = spec.get_int_attribute("Orientation", 1)
-    if 2 <= orientation <= 8:
-        buffer = oiio.ImageBuf(pixels)
-        buffer.orientation = orientation
-        buffer = oiio.ImageBufAlgo.reorient(buffer)
-        turned = np.asarray(buffer.get_pixels(oiio.FLOAT), dtype=np.float32)
-        pixels = turned.reshape(buffer.spec().height, buffer.spec().width, spec.nchannels)
+        file = decoding.decode_file(path, limits)
+    except DecodingError as error:
+        raise UserError(_sentence(path, error, limits)) from error
+    notes = _peculiarities(file)
+    stored, orientation = file.pixels, file.attributes["Orientation"]
+    if isinstance(orientation, int) and orientation in UPRIGHT:
+        stored = np.ascontiguousarray(UPRIGHT[orientation](stored))
         notes.append(f"turned upright (EXIF orientation {orientation})")
-    return DecodedImage(pixels, spec, tuple(notes))
+    return DecodedImage(stored, replace(file, pixels=stored), tuple(notes))
+
+
+UPRIGHT: dict[int, Callable[[np.ndarray], np.ndarray]] = {
+    2: lambda stored: stored[:, ::-1],
+    3: lambda stored: stored[::-1, ::-1],
+    4: lambda stored: stored[::-1],
+    5: lambda stored: stored.swapaxes(0, 1),
+    6: lambda stored: np.rot90(stored, -1),
+    7: lambda stored: stored[::-1, ::-1].swapaxes(0, 1),
+    8: lambda stored: np.rot90(stored, 1),
+}
+"""How an image of an EXIF orientation is turned upright; 1 is upright."""
+
+
+def _sentence(path: Path, error: DecodingError, limits: Limits) -> str:
+    """Say in one sentence why a file was not decoded, and what to do."""
+    gibibytes = f"{limits.memory / 2**30:.3g} GiB"
+    return {
+        "format": f"{path} is not an image that can be read ({error.reason}); "
+        "give a JPEG, PNG, TIFF, EXR or HDR file.",
+        "damage": f"{path} is damaged or cut short ({error.reason}); copy or export it again.",
+        "size": f"{path} is too large ({error.reason}); "
+        f"shrink it to at most {limits.side} pixels a side and to what fits in {gibibytes} of memory.",
+        "flat": f"{path} is a deep or volume image; export it as a flat picture.",
+        "name": f"The name of {path} is not valid text; rename the file.",
+        "memory": f"{path} takes more than {gibibytes} of memory to decode; shrink it or export it anew.",
+        "time": f"{path} takes longer than {limits.seconds:.0f} s to decode; export it anew.",
+    }.get(error.kind, f"{path} makes the decoder fail, so it is damaged or forged; export it anew.")
 
 
 @contextmanager
@@ -107,7 +117,9 @@ def write_together(paths: Sequence[Path | str]) -> Iterator[list[Path]]:
 
     Yields temporary siblings of `paths` with the same extensions, already created and empty. When the
     block ends well they are flushed to disk and renamed to `paths`, replacing what was there; when
-    anything is raised they are removed, and so are the folders that were created for them.
+    anything is raised they are removed, and so are the folders that were created for them. Of several, the
+    last is taken away before the others are replaced and comes back last: where it is, even after a kill,
+    everything beside it is of the same run.
 
     Raises:
         UserError: a folder cannot be made or written, a target is a folder, or the disk is full; also
@@ -130,6 +142,8 @@ def write_together(paths: Sequence[Path | str]) -> Iterator[list[Path]]:
         for temporary in temporaries:
             with temporary.open("rb+") as file:
                 os.fsync(file.fileno())
+        if len(targets) > 1:
+            targets[-1].resolve().unlink(missing_ok=True)
         for current, temporary in zip(targets, temporaries, strict=True):
             new = not current.exists()
             os.replace(temporary, current.resolve())
@@ -176,6 +190,8 @@ def _make_folders(folder: Path) -> list[Path]:
 
 def _require_regular_file(path: Path) -> None:
     """Refuse what cannot be a photo before any library touches it (a pipe would block for ever)."""
+    if "\0" in str(path):
+        raise UserError(f"{path} is not the name of a file; check it.")
     try:
         status = path.stat()
         if stat.S_ISDIR(status.st_mode):
@@ -193,55 +209,18 @@ def _require_regular_file(path: Path) -> None:
         ) from error
 
 
-def _require_reasonable_size(path: Path, spec: Any) -> None:
-    """Refuse, from the header alone, what would not fit in memory or is not a flat picture."""
-    width, height = spec.width, spec.height
-    if width > MAXIMUM_SIDE or height > MAXIMUM_SIDE or width * height > MAXIMUM_PIXELS:
-        raise UserError(
-            f"{path} claims {width} x {height} pixels; shrink it to at most {MAXIMUM_SIDE} a side "
-            f"and {MAXIMUM_PIXELS // 10**6} megapixels."
-        )
-    if spec.deep or spec.depth > 1:
-        raise UserError(f"{path} is a deep or volume image; export it as a flat picture.")
-
-
-def _peculiarities(spec: Any) -> list[str]:
+def _peculiarities(file: Decoded) -> list[str]:
     """Say in plain words what distinguishes a file from an ordinary 8-bit RGB picture."""
     notes = []
-    images = spec.get_int_attribute("oiio:subimages", 1)
-    if images > 1:
+    images, (height, width) = file.attributes["oiio:subimages"], file.pixels.shape[:2]
+    if isinstance(images, int) and images > 1:
         notes.append(f"first of {images} images in the file used")
-    if str(spec.format) != "uint8":
-        notes.append(f"{spec.format} pixels kept at full precision")
-    stored = spec.getattribute("jpeg:ColorSpace") or spec.getattribute("tiff:ColorSpace")
-    if stored:
-        notes.append(f"stored as {stored}, converted to RGB without its profile")
-    if (spec.full_width, spec.full_height) != (spec.width, spec.height):
-        notes.append(
-            f"all stored pixels used, not the display window of {spec.full_width} x {spec.full_height}"
-        )
+    if file.format != "uint8":
+        notes.append(f"{file.format} pixels kept at full precision")
+    space = file.attributes["jpeg:ColorSpace"] or file.attributes["tiff:ColorSpace"]
+    if space:
+        notes.append(f"stored as {printable(str(space))}, converted to RGB without its profile")
+    if file.display != (width, height):
+        shown = " x ".join(str(side) for side in file.display)
+        notes.append(f"all stored pixels used, not the display window of {shown}")
     return notes
-
-
-@contextmanager
-def _without_library_messages() -> Iterator[None]:
-    """Keep libpng from printing on standard error what OpenImageIO reports to us anyway."""
-    with _STANDARD_ERROR, contextlib.ExitStack() as stack:
-        try:
-            saved = os.dup(2)
-        except OSError:  # the process has no standard error
-            yield
-            return
-        stack.callback(os.close, saved)
-        with open(os.devnull, "wb") as silence:
-            os.dup2(silence.fileno(), 2)
-        try:
-            yield
-        finally:
-            os.dup2(saved, 2)
-
-
-def _one_line(message: str) -> str:
-    """First line of a library's message, without its trailing full stop."""
-    lines = message.strip().splitlines()
-    return lines[0].rstrip(" .") if lines else ""

@@ -191,7 +191,7 @@ def _encode(
 def _decode(name: str, path: Path, decoded: DecodedImage) -> Float[Tensor, "1 channels h w"]:
     """Invert `_encode` and the quantisation, as far as that goes."""
     channels = CHANNELS[name]
-    found = decoded.pixels.shape[-1]
+    found = decoded.stored.shape[-1]
     if found < channels:
         raise UserError(f"{path} has {found} channel(s), but a {name} map has {channels}; export it again.")
     stored = torch.from_numpy(np.ascontiguousarray(decoded.pixels[..., :channels].transpose(2, 0, 1)))[None]

@@ -6,7 +6,7 @@ Nothing here crops, guesses exposure or knows about lights; `files.py` does the 
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal, get_args
@@ -18,11 +18,21 @@ from torch import Tensor
 from torch.nn.functional import interpolate
 
 from nets.color import srgb_to_linear
+from nets.decoding import Limits
+from nets.text import printable
+from refine.bands import bands
+from refine.color_spaces import CHOICES, SRGB, ColorSpace, embedded_space, to_rec709
 from refine.errors import UserError
 from refine.files import DecodedImage, decode_image
 
 MINIMUM_SIDE = 16
 """Shortest side of a photo, in pixels."""
+
+NEGATIVE = -1e-4
+"""What is below is told to have been negative; less is rounding."""
+
+BRIGHTEST = 1e30
+"""Light is clamped here: room for sums of it, far beyond any photo."""
 
 CLIPPED = 254.5 / 255.0
 """Stored value, as a fraction of the format's maximum, from which on a channel counts as clipped."""
@@ -55,54 +65,9 @@ class Photo:
         return self.linear.shape[-2], self.linear.shape[-1]
 
 
-@dataclass(frozen=True)
-class _ColorSpace:
-    """A transfer curve ("srgb" or the exponent of a power law) and RGB chromaticities."""
-
-    name: str
-    transfer: Literal["srgb"] | float
-    primaries: tuple[float, ...]  # x, y of red, green, blue and white
-
-
-_PRIMARIES = {  # in the spelling of the colour interop identifiers that OpenImageIO reports
-    "rec709": (0.64, 0.33, 0.30, 0.60, 0.15, 0.06, 0.3127, 0.3290),
-    "p3d65": (0.680, 0.320, 0.265, 0.690, 0.150, 0.060, 0.3127, 0.3290),
-    "adobergb": (0.64, 0.33, 0.21, 0.71, 0.15, 0.06, 0.3127, 0.3290),
-    "rec2020": (0.708, 0.292, 0.170, 0.797, 0.131, 0.046, 0.3127, 0.3290),
-    "romm": (0.734699, 0.265301, 0.159597, 0.840403, 0.036598, 0.000105, 0.345704, 0.358540),
-    "ap1": (0.713, 0.293, 0.165, 0.830, 0.128, 0.044, 0.32168, 0.33767),
-    "ap0": (0.7347, 0.2653, 0.0, 1.0, 0.0001, -0.0770, 0.32168, 0.33767),
-}
-_TRANSFERS: dict[str, Literal["srgb"] | float] = {
-    "srgb": "srgb",
-    "lin": 1.0,
-    "g18": 1.8,
-    "g22": 2.2,
-    "g24": 2.4,
-}
-_SRGB = _ColorSpace("sRGB", "srgb", _PRIMARIES["rec709"])
-_LINEAR = _ColorSpace("linear Rec. 709", 1.0, _PRIMARIES["rec709"])
-_DISPLAY_P3 = _ColorSpace("Display P3", "srgb", _PRIMARIES["p3d65"])
-_ADOBE_RGB = _ColorSpace("Adobe RGB (1998)", 563.0 / 256.0, _PRIMARIES["adobergb"])
-_CHOICES = {
-    "srgb": _SRGB,
-    "linear": _LINEAR,
-    "gamma22": _ColorSpace("gamma 2.2", 2.2, _PRIMARIES["rec709"]),
-    "display-p3": _DISPLAY_P3,
-    "adobe-rgb": _ADOBE_RGB,
-}
-_PROFILES = {  # what an ICC profile's description contains, in lower case -> what the profile means
-    "display p3": _DISPLAY_P3,
-    "adobe rgb": _ADOBE_RGB,
-    "prophoto": _ColorSpace("ProPhoto RGB", 1.8, _PRIMARIES["romm"]),
-    "srgb": _SRGB,
-    "urgb": _SRGB,
-    "gray gamma 2.2": _CHOICES["gamma22"],
-}
-_BRADFORD = np.array([[0.8951, 0.2664, -0.1614], [-0.7502, 1.7135, 0.0367], [0.0389, -0.0685, 1.0296]])
-
-
-def read_photo(path: Path | str, *, color_space: ColorSpaceChoice = "auto") -> Photo:
+def read_photo(
+    path: Path | str, *, color_space: ColorSpaceChoice = "auto", limits: Limits | None = None
+) -> Photo:
     """Read a photo (JPEG, PNG, TIFF, EXR, HDR, ...) and make it linear.
 
     The EXIF orientation is applied, alpha is dropped, grey becomes three equal channels and embedded
@@ -112,6 +77,7 @@ def read_photo(path: Path | str, *, color_space: ColorSpaceChoice = "auto") -> P
         path: an image file; its content decides the format, not its extension.
         color_space: "auto" honours the embedded profile or tag, and without one takes integer files as
             sRGB (the piecewise curve) and float files as linear; any other value overrules the file.
+        limits: memory and time that the file may take; by default those of `nets.decoder.Limits`.
 
     Raises:
         UserError: the file cannot be decoded (see `decode_image`), has a side below `MINIMUM_SIDE`, or
@@ -119,16 +85,16 @@ def read_photo(path: Path | str, *, color_space: ColorSpaceChoice = "auto") -> P
     """
     source = os.fspath(path)
     chosen = _chosen(color_space)
-    decoded = decode_image(path)
+    decoded = decode_image(path, limits)
     notes = list(decoded.notes)
-    pixels = _to_rgb(decoded, notes)
+    colors = _colors(decoded, notes)
     if chosen is None:
-        space = _embedded_space(decoded, notes)
+        space = embedded_space(decoded, notes)
         notes.append(f"colours read as {space.name}")
     else:
         space = chosen
         notes.append(f"colours read as {space.name}, as asked, whatever the file says")
-    return _linear_photo(pixels, space, decoded.integer, notes, source)
+    return _linear_photo(colors, decoded.size, space, decoded.integer, notes, source)
 
 
 def photo_from_array(
@@ -161,7 +127,9 @@ def photo_from_array(
         pixels = pixels.astype(np.float32)
     else:
         raise UserError(f"The array holds {pixels.dtype}; convert it to uint8, uint16 or float first.")
-    pixels = _drop_alpha(pixels, {2: 1, 4: 3}.get(pixels.shape[-1], -1), notes)
+    if pixels.shape[-1] in (2, 4):
+        _note_alpha(float(np.mean(pixels[..., -1] < 1.0)), notes)
+        pixels = pixels[..., :-1]
     if pixels.shape[-1] == 1:
         notes.append("grey repeated to three channels")
         pixels = np.repeat(pixels, 3, axis=-1)
@@ -171,8 +139,9 @@ def photo_from_array(
             f"The float array reaches {np.nanmax(pixels):.4g} but encoded floats end at 1; "
             'say color_space="linear" for linear light, or divide by its maximum.'
         )
-    notes.append(f"{'float' if not integer else 'integer'} array, colours read as {(space or _SRGB).name}")
-    return _linear_photo(pixels, space or _SRGB, integer, notes, "array")
+    notes.append(f"{'float' if not integer else 'integer'} array, colours read as {(space or SRGB).name}")
+    size = pixels.shape[0], pixels.shape[1]
+    return _linear_photo(lambda rows: pixels[rows], size, space or SRGB, integer, notes, "array")
 
 
 def resize_photo(photo: Photo, longer_side: int) -> Photo:
@@ -204,130 +173,101 @@ def resize_photo(photo: Photo, longer_side: int) -> Photo:
     return Photo(linear, saturated <= 0.0, (*photo.notes, note), photo.source)
 
 
-def _chosen(color_space: str) -> _ColorSpace | None:
+def _chosen(color_space: str) -> ColorSpace | None:
     """The colour space a caller insists on; None for "auto"."""
     if color_space not in get_args(ColorSpaceChoice):
         choices = ", ".join(get_args(ColorSpaceChoice))
         raise UserError(f"Colour space {color_space!r} is unknown; choose one of {choices}.")
-    return _CHOICES.get(color_space)
+    return CHOICES.get(color_space)
 
 
-def _to_rgb(decoded: DecodedImage, notes: list[str]) -> Float32[np.ndarray, "h w 3"]:
-    """Reduce whatever channels a file has to RGB."""
-    spec = decoded.spec
-    names = list(spec.channelnames)
+Rows = Callable[[slice], Float32[np.ndarray, "rows w 3"]]
+"""Some rows of a picture: a photo is made linear a band at a time, which takes little memory besides."""
+
+
+def _colors(decoded: DecodedImage, notes: list[str]) -> Rows:
+    """Reduce whatever channels a file has to RGB, alpha divided out where it was multiplied in."""
+    names = list(decoded.file.channels)
     alpha = names.index("A") if "A" in names else -1  # the header's own index is wrong for GIF
+    colors = [index for index in range(len(names)) if index != alpha]
+    kept = colors[:3] if len(colors) >= 3 else colors[:1] * 3
+    if not colors:
+        raise UserError("The picture has no channel but alpha; export it with its colours.")
+    divide = False
     if alpha >= 0:
-        del names[alpha]
-    associated = not spec.get_int_attribute("oiio:UnassociatedAlpha", 0)
-    pixels = _drop_alpha(decoded.pixels, alpha, notes, associated=associated)
-    kept = 3 if len(names) >= 3 else 1
-    if len(names) > kept:
-        notes.append(f"channels {', '.join(names[kept:])} ignored, {', '.join(names[:kept])} used")
-    if kept == 3:
-        return pixels[..., :3]
-    notes.append("grey repeated to three channels")
-    return np.repeat(pixels[..., :1], 3, axis=-1)
+        height, width = decoded.size
+        transparent = sum(
+            int(np.count_nonzero(decoded.rows(rows)[..., alpha] < 1.0)) for rows in bands(height, width)
+        )
+        divide = transparent > 0 and not decoded.file.attributes["oiio:UnassociatedAlpha"]
+        _note_alpha(transparent / (height * width), notes, divided=divide)
+    if len(colors) > 3 or len(colors) == 2:
+        used = [names[index] for index in dict.fromkeys(kept)]
+        ignored = [names[index] for index in colors if index not in kept]
+        notes.append(f"channels {printable(', '.join(ignored))} ignored, {printable(', '.join(used))} used")
+    if len(colors) < 3:
+        notes.append("grey repeated to three channels")
+
+    def rows_of(rows: slice) -> Float32[np.ndarray, "rows w 3"]:
+        pixels = decoded.rows(rows)
+        picture = pixels[..., kept]
+        if divide:
+            opacity = pixels[..., alpha : alpha + 1]
+            np.divide(picture, opacity, out=picture, where=(opacity > 0.0) & (opacity < 1.0))
+        return picture
+
+    return rows_of
 
 
-def _drop_alpha(
-    pixels: Float32[np.ndarray, "h w channels"], index: int, notes: list[str], *, associated: bool = False
-) -> Float32[np.ndarray, "h w fewer"]:
-    """Remove the alpha channel, first dividing colours that had been multiplied by it."""
-    if index < 0:
-        return pixels
-    alpha = pixels[..., index : index + 1]
-    colors = np.delete(pixels, index, axis=-1)
-    transparent = float(np.mean(alpha < 1.0))
+def _note_alpha(transparent: float, notes: list[str], *, divided: bool = False) -> None:
     note = "alpha dropped"
     if transparent > 0.0:
         note += f" ({transparent:.1%} of the pixels were not opaque)"
-        if associated:
-            colors = np.divide(colors, alpha, out=colors, where=(alpha > 0.0) & (alpha < 1.0))
-            note += ", colours divided by it"
-    notes.append(note)
-    return colors
-
-
-def _embedded_space(decoded: DecodedImage, notes: list[str]) -> _ColorSpace:
-    """What the file says about its colours: ICC profile, EXR chromaticities, tags, then habit."""
-    spec = decoded.spec
-    fallback = _SRGB if decoded.integer else _LINEAR
-    description = spec.getattribute("ICCProfile:profile_description")
-    if description or spec.getattribute("ICCProfile") is not None:
-        lowered = str(description).lower()
-        for key, space in _PROFILES.items():
-            if key in lowered:
-                return replace(space, name=str(description), transfer=1.0) if "linear" in lowered else space
-        notes.append(f"colour profile {description or 'without a name'!r} not understood, ignored")
-        return fallback
-    chromaticities = spec.getattribute("chromaticities")
-    if chromaticities is not None and len(chromaticities) == 8:
-        return _ColorSpace("linear light with the file's own chromaticities", 1.0, tuple(chromaticities))
-    tag = str(spec.getattribute("oiio:ColorSpace") or "")
-    transfer, _, rest = tag.partition("_")
-    primaries = rest.partition("_")[0]
-    if transfer in _TRANSFERS and primaries in _PRIMARIES:
-        exif = spec.get_int_attribute("Exif:ColorSpace", 1)
-        if (transfer, primaries, exif) == ("srgb", "rec709", 2):
-            return _ADOBE_RGB
-        if exif == 65535:
-            notes.append("the camera calls the colours uncalibrated but embeds no profile")
-        tagged = _ColorSpace(tag, _TRANSFERS[transfer], _PRIMARIES[primaries])
-        return next(
-            (known for known in (_SRGB, _LINEAR) if known == replace(tagged, name=known.name)), tagged
-        )
-    if tag:
-        notes.append(f"colour space {tag!r} not understood, ignored")
-    return fallback
+    notes.append(note + (", colours divided by it" if divided else ""))
 
 
 def _linear_photo(
-    pixels: Float32[np.ndarray, "h w 3"], space: _ColorSpace, integer: bool, notes: list[str], source: str
+    colors: Rows,
+    size: tuple[int, int],
+    space: ColorSpace,
+    integer: bool,
+    notes: list[str],
+    source: str,
 ) -> Photo:
     """Check the pixels, mark the clipped ones and take them from `space` to linear Rec. 709."""
-    height, width = pixels.shape[:2]
-    if min(height, width) < MINIMUM_SIDE:
+    height, width = size
+    if min(size) < MINIMUM_SIDE:
         raise UserError(f"{source} has {width} x {height} pixels; both sides need at least {MINIMUM_SIDE}.")
-    bad = int(np.count_nonzero(~np.isfinite(pixels).all(axis=-1)))
-    if bad:
-        raise UserError(f"{source} holds NaN or infinity in {bad} of its pixels; repair or re-export it.")
-    stored = torch.from_numpy(np.ascontiguousarray(pixels.transpose(2, 0, 1)))[None]
+    matrix = None
+    if not space.rec709:
+        matrix = torch.from_numpy(to_rec709(space.primaries)).float()
     can_clip = integer or space.transfer != 1.0
-    saturated = (stored >= CLIPPED).any(dim=1, keepdim=True) & can_clip
-    stored = _without_negatives(stored, "negative values", notes)
-    linear = srgb_to_linear(stored) if space.transfer == "srgb" else stored**space.transfer
-    if space.primaries != _PRIMARIES["rec709"]:
-        matrix = torch.from_numpy(_to_rec709(space.primaries)).to(linear)
-        linear = torch.einsum("ij,bjhw->bihw", matrix, linear)
-        linear = _without_negatives(linear, "colours outside Rec. 709", notes)
-    return Photo(linear, ~saturated, tuple(notes), source)
+    linear, unsaturated = torch.empty(1, 3, *size), torch.empty(1, 1, *size, dtype=torch.bool)
+    illegal = negative = outside = 0
+    for rows in bands(height, width):
+        stored = torch.from_numpy(np.ascontiguousarray(colors(rows).transpose(2, 0, 1)))[None]
+        illegal += _count(~torch.isfinite(stored))
+        saturated = (stored >= CLIPPED).any(dim=1, keepdim=True) & can_clip
+        unsaturated[..., rows, :] = ~saturated
+        negative += _count(stored < NEGATIVE)
+        stored = stored.clamp(min=0.0)
+        light = srgb_to_linear(stored) if space.transfer == "srgb" else stored**space.transfer
+        if matrix is not None:
+            light = torch.einsum("ij,bjhw->bihw", matrix, light)
+            outside += _count(light < NEGATIVE)
+            light = light.clamp(min=0.0)
+        linear[..., rows, :] = light.clamp(max=BRIGHTEST)
+    if illegal:
+        raise UserError(f"{source} holds NaN or infinity in {illegal} of its pixels; repair or re-export it.")
+    for count, what in ((negative, "negative values"), (outside, "colours outside Rec. 709")):
+        if count:
+            notes.append(f"{what} in {count / (height * width):.1%} of the pixels clamped to 0")
+    return Photo(linear, unsaturated, tuple(notes), source)
 
 
-def _without_negatives(
-    image: Float[Tensor, "1 3 h w"], what: str, notes: list[str]
-) -> Float[Tensor, "1 3 h w"]:
-    """Clamp at 0 and note it when that changes more than rounding."""
-    share = float((image < -1e-4).any(dim=1).float().mean())
-    if share > 0.0:
-        notes.append(f"{what} in {share:.1%} of the pixels clamped to 0")
-    return image.clamp(min=0.0)
-
-
-def _to_rec709(primaries: Sequence[float]) -> np.ndarray:  # [3, 3]
-    """Matrix from linear RGB of some chromaticities to Rec. 709, Bradford-adapted to its white."""
-
-    def to_xyz(chromaticities: Sequence[float]) -> tuple[np.ndarray, np.ndarray]:
-        x, y = np.array(chromaticities, dtype=np.float64).reshape(4, 2).T
-        columns = np.stack([x / y, np.ones(4), (1.0 - x - y) / y])
-        white = columns[:, 3]
-        return columns[:, :3] * np.linalg.solve(columns[:, :3], white), white
-
-    source, source_white = to_xyz(primaries)
-    target, target_white = to_xyz(_PRIMARIES["rec709"])
-    gain = (_BRADFORD @ target_white) / (_BRADFORD @ source_white)
-    adapt = np.linalg.solve(_BRADFORD, gain[:, None] * _BRADFORD)
-    return np.linalg.solve(target, adapt @ source)
+def _count(flags: Bool[Tensor, "1 3 rows w"]) -> int:
+    """Pixels with a flag in any channel."""
+    return int(flags.any(dim=1).sum())
 
 
 def _height_width_channels(array: np.ndarray | Tensor) -> tuple[np.ndarray, str]:

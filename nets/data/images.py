@@ -16,6 +16,10 @@ import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
+from nets import decoding
+from nets.decoding import DecodingError
+from nets.text import printable
+
 NORMAL_Z_FLOOR = 0.02
 """Smallest z of a stored normal: the surface faces the viewer, slopes are at most 50."""
 
@@ -24,7 +28,11 @@ ROUGHNESS_FLOOR = 1.0 / 255.0
 
 
 class DataError(ValueError):
-    """A file or folder that cannot be read as what it should be; the message names it."""
+    """A file or folder that cannot be read as what it should be; the message, of one line, names it."""
+
+    def __init__(self, message: str) -> None:
+        """Take the message."""
+        super().__init__(printable(message))
 
 
 LISTED = 5
@@ -48,26 +56,34 @@ def read_image(path: Path) -> tuple[Float[np.ndarray, "height width channels"], 
         and whether the file stores floating-point numbers (and so linear light, by convention).
 
     Raises:
-        DataError: the file is missing, not an image, truncated, or holds NaN.
+        DataError: the file is missing, not an image, truncated, too large, or holds NaN.
     """
     if not path.is_file():
         raise DataError(f"{path} does not exist")
-    source = oiio.ImageInput.open(str(path))
-    if source is None:
-        raise DataError(f"{path} is not a readable image: {_reason(oiio.geterror())}")
     try:
-        spec = source.spec()
-        channels = 3 if spec.nchannels >= 3 else 1
-        pixels = source.read_image(0, 0, 0, channels, "float")
-        if pixels is None or source.has_error:
-            raise DataError(f"{path} is damaged or truncated: {_reason(source.geterror())}")
-        is_float = spec.format.basetype in (oiio.HALF, oiio.FLOAT, oiio.DOUBLE)
-    finally:
-        source.close()
-    array = np.asarray(pixels, dtype=np.float32).reshape(spec.height, spec.width, channels)
+        file = decoding.decode_file(path)
+    except DecodingError as error:
+        raise DataError(f"{path} {PROBLEMS[error.kind].format(error.reason)}") from error
+    stored = file.pixels[..., : 3 if file.pixels.shape[2] >= 3 else 1]
+    array = stored.astype(np.float32)
+    if stored.dtype.kind == "u":
+        array /= np.float32(np.iinfo(stored.dtype).max)
     if not np.isfinite(array).all():
         raise DataError(f"{path} holds NaN or infinity")
-    return array, is_float
+    return array, not file.integer
+
+
+PROBLEMS = {
+    "format": "is not a readable image: {}",
+    "damage": "is damaged or truncated: {}",
+    "size": "is too large to decode: {}",
+    "flat": "is a deep or volume image, not a flat picture",
+    "name": "has a name that is not text",
+    "memory": "takes too much memory to decode",
+    "time": "takes too long to decode",
+    "crash": "makes the decoder fail, so it is damaged or forged",
+}
+"""What is said of a file, by the kind of `DecodingError`."""
 
 
 def write_image(path: Path, pixels: UInt8[np.ndarray, "height width channels"]) -> None:

@@ -10,6 +10,7 @@ import numpy as np
 import OpenImageIO as oiio
 import pytest
 
+from nets.decoder import RESIZING_BYTES, Limits
 from refine import files
 from refine.errors import UserError
 from refine.files import decode_image, write_atomically, write_text_atomically, write_together
@@ -112,20 +113,14 @@ def test_decoding_divides_integers_by_their_maximum(tmp_path: Path) -> None:
     np.testing.assert_allclose(decoded.pixels, stored / 65535, rtol=2e-7)
 
 
-def test_oversized_images_are_refused_from_the_header_alone(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_oversized_images_are_refused_from_the_header_alone(tmp_path: Path) -> None:
     path = tmp_path / "a.png"
     oiio.ImageBuf(np.zeros((40, 50, 3), np.uint8)).write(str(path))
-    monkeypatch.setattr(files, "MAXIMUM_SIDE", 49)
-    with pytest.raises(UserError, match="50 x 40"):
-        decode_image(path)
-    monkeypatch.setattr(files, "MAXIMUM_SIDE", 50)
-    monkeypatch.setattr(files, "MAXIMUM_PIXELS", 1999)
-    with pytest.raises(UserError, match="50 x 40"):
-        decode_image(path)
-    monkeypatch.setattr(files, "MAXIMUM_PIXELS", 2000)
-    assert decode_image(path).pixels.shape == (40, 50, 3)
+    enough = 40 * 50 * RESIZING_BYTES
+    for limits in (Limits(side=49), Limits(memory=enough - 1)):
+        with pytest.raises(UserError, match=r"too large \(50 x 40\)"):
+            decode_image(path, limits)
+    assert decode_image(path, Limits(side=50)).pixels.shape == (40, 50, 3)
 
 
 def test_libraries_print_nothing_and_standard_error_survives(
