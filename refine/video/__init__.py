@@ -1,0 +1,1 @@
+"""Videos of a material under a light that moves, in a loop."""
