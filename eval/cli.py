@@ -22,6 +22,7 @@ from eval.development import (
     refinement_estimator,
     require,
 )
+from eval.figures_cli import figures
 from eval.lights import evaluate_lights, light_estimator, lights_markdown
 from eval.options import (
     MatchExposure,
@@ -44,6 +45,7 @@ from refine.stages import RECIPES, find_recipe
 main = typer.Typer(add_completion=False, no_args_is_help=True, help="Evaluate SVBRDF capture.")
 main.command()(table1)
 main.command()(table2)
+main.command()(figures)
 
 Data = Annotated[Path, typer.Option(help="Holds strips/des18_dev, strips/des19_dev and materials/dev.")]
 Checkpoint = Annotated[str, typer.Option(help="Checkpoint: a shipped name or a file.")]

@@ -1,0 +1,158 @@
+"""A sheet of pictures for print: rows and columns with heads, a line below each picture, and gaps that show.
+
+Sizes are in points and inches of a page that is as wide as a paper's two columns.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import matplotlib.style
+import numpy as np
+from jaxtyping import Float
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from torch import Tensor
+
+from nets.color import linear_to_srgb
+from nets.svbrdf import SVBRDF
+from refine.files import write_atomically
+
+PAGE_WIDTH = 7.0
+"""Inches: the text width of a two-column page."""
+
+LARGEST_PICTURE = 1.25
+"""Inches of a side: a sheet of few columns is narrower than the page."""
+
+DPI = 200
+FONT, SMALL = 7.0, 5.5
+"""Points of heads and of the lines below pictures; print begins to be unreadable at 5."""
+
+LABEL, HEAD, LINE, SPACE = 0.16, 0.17, 0.12, 0.03
+"""Inches: of the rows' labels, of the heads, of the line below a picture, between pictures."""
+
+INK, FAINT, NOTHING = "#202020", "#606060", "#ececec"
+
+
+@dataclass(frozen=True)
+class Picture:
+    """One picture, or the reason why there is none.
+
+    Attributes:
+        image: display values in [0, 1], one or three channels; None leaves the place empty.
+        below: a short line; without an image, why there is none.
+    """
+
+    image: Float[Tensor, "1 channels h w"] | None
+    below: str = ""
+
+
+@dataclass(frozen=True)
+class Line:
+    """A row of pictures and what it is called."""
+
+    label: str
+    pictures: tuple[Picture, ...]
+
+
+@dataclass(frozen=True)
+class Sheet:
+    """Pictures under heads.
+
+    Attributes:
+        heads: of the columns.
+        lines: each with a picture per column.
+    """
+
+    heads: tuple[str, ...]
+    lines: tuple[Line, ...] = field(default=())
+
+
+def as_seen(linear: Float[Tensor, "b 3 h w"]) -> Float[Tensor, "b 3 h w"]:
+    """Return linear radiance or albedo as a screen shows it: clamped, sRGB."""
+    return linear_to_srgb(linear.clamp(0.0, 1.0))
+
+
+def map_picture(material: SVBRDF, name: str) -> Float[Tensor, "1 channels h w"]:
+    """Return a map as its file shows it: normals as (n + 1) / 2, albedos in sRGB, roughness as it is."""
+    tensor: Tensor = getattr(material, name)
+    if name == "normal":
+        return tensor * 0.5 + 0.5
+    return tensor if name == "roughness" else as_seen(tensor)
+
+
+def draw(sheet: Sheet) -> Figure:
+    """Return the sheet as a figure."""
+    columns, rows = len(sheet.heads), len(sheet.lines)
+    side = min(LARGEST_PICTURE, (PAGE_WIDTH - LABEL - SPACE * (columns - 1)) / columns)
+    width = LABEL + columns * side + SPACE * (columns - 1)
+    height = HEAD + rows * (side + LINE)
+    figure = Figure(figsize=(width, height), dpi=DPI, facecolor="white")
+
+    def place(left: float, top: float) -> tuple[float, float]:
+        return left / width, 1.0 - top / height
+
+    for row, line in enumerate(sheet.lines):
+        top = HEAD + row * (side + LINE)
+        x, y = place(LABEL * 0.4, top + side / 2)
+        figure.text(x, y, line.label, fontsize=FONT, color=INK, rotation=90, ha="center", va="center")
+        for column, picture in enumerate(line.pictures):
+            left = LABEL + column * (side + SPACE)
+            if row == 0:
+                x, y = place(left + side / 2, HEAD * 0.7)
+                figure.text(x, y, sheet.heads[column], fontsize=FONT, color=INK, ha="center", va="baseline")
+            x, y = place(left, top + side)
+            _show(figure.add_axes((x, y, side / width, side / height)), picture)
+            if picture.image is not None:
+                x, y = place(left + side / 2, top + side + LINE * 0.72)
+                figure.text(x, y, picture.below, fontsize=SMALL, color=FAINT, ha="center", va="baseline")
+    return figure
+
+
+def write(figure: Figure, path: Path) -> None:
+    """Write a figure, whole or not at all; the suffix says as what (png, jpg, pdf, ...).
+
+    Raises:
+        ValueError: a suffix that matplotlib does not know.
+    """
+    kind = path.suffix.lstrip(".").lower()
+    known = FigureCanvasAgg.get_supported_filetypes()
+    if kind not in known:
+        raise ValueError(f"{path} cannot be written: figures are {', '.join(sorted(known))}")
+    undated = {"pdf": {"CreationDate": None}, "svg": {"Date": None}, "png": {"Software": None}}
+    with matplotlib.style.context("default"), write_atomically(path) as temporary:
+        figure.savefig(temporary, format=kind, dpi=DPI, metadata=undated.get(kind))
+
+
+def grid(heads: Sequence[str], lines: Sequence[tuple[str, Sequence[Picture]]]) -> Sheet:
+    """Return a sheet of plain sequences.
+
+    Raises:
+        ValueError: a row that has not one picture per head.
+    """
+    made = tuple(Line(label, tuple(pictures)) for label, pictures in lines)
+    for line in made:
+        if len(line.pictures) != len(heads):
+            raise ValueError(f"row {line.label!r} has {len(line.pictures)} pictures for {len(heads)} columns")
+    return Sheet(tuple(heads), made)
+
+
+def _show(axes: Axes, picture: Picture) -> None:
+    axes.set_xticks([])
+    axes.set_yticks([])
+    for spine in axes.spines.values():
+        spine.set_visible(False)
+    if picture.image is None:
+        axes.set_facecolor(NOTHING if picture.below else "white")
+        axes.text(0.5, 0.5, picture.below, fontsize=SMALL, color=FAINT, ha="center", va="center", wrap=True)
+        return
+    axes.imshow(_pixels(picture.image), interpolation="antialiased", aspect="auto")
+
+
+def _pixels(image: Tensor) -> np.ndarray:  # uint8 [h, w, 3]
+    values = image[0].detach().cpu().clamp(0.0, 1.0).expand(3, -1, -1).permute(1, 2, 0)
+    pixels: np.ndarray = (values * 255.0).round().byte().numpy()
+    return pixels
