@@ -5,6 +5,7 @@ Nothing here is normalised, and there are no skips: what a material is must pass
 
 from __future__ import annotations
 
+import math
 from dataclasses import asdict, dataclass
 from itertools import pairwise
 
@@ -23,6 +24,10 @@ MULTIPLES = (1, 2, 4, 8, 8)
 
 STEEPEST = 1.0
 """Slope at the ends of tanh: normals are (x, y, 1), normalised."""
+
+
+LAST_SCALE = 0.1
+"""The last layer's weights begin this much smaller, so that the first materials are plain ones."""
 
 
 @dataclass(frozen=True)
@@ -76,6 +81,13 @@ class Autoencoder(nn.Module):
             nn.ConvTranspose2d(inputs, outputs, 4, stride=2, padding=1)
             for inputs, outputs in pairwise((*widths[::-1], FREE_CHANNELS))
         )
+        for convolution in (*self.encoder, *self.decoder):
+            # As loud after a layer as before, or nothing would get through ten of them.
+            fan = convolution.in_channels * 16 / (4 if isinstance(convolution, nn.ConvTranspose2d) else 1)
+            nn.init.normal_(convolution.weight, std=math.sqrt(2.0 / ((1.0 + LEAKY_SLOPE**2) * fan)))
+            nn.init.zeros_(convolution.bias)
+        with torch.no_grad():
+            self.decoder[-1].weight.mul_(LAST_SCALE)
 
     def encode(self, maps: Float[Tensor, "b 10 h w"]) -> Float[Tensor, "b c h2 w2"]:
         """Return the latent code of maps in [-1, 1], in the order of `MAPS`: a 32nd of their size.
