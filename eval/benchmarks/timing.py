@@ -65,24 +65,29 @@ def take_turns(
         stage: of which only the rates are used.
         engines: names in `refine.engine.ENGINES`.
         rounds: turns of each, after one that does not count: in it, what is compiled is compiled.
-        seconds: that a turn should take.
+        seconds: that a turn's iterations should take.
     """
     parameters = Parameters.from_svbrdf(problem.start)
     counts = dict.fromkeys(engines, ITERATIONS[0])
     turns = Turns({engine: [] for engine in engines}, {})
     for turn in range(rounds + 1):
         for engine in engines:
-            with peak_memory() as memory:
+
+            def seconds_of(iterations: int, engine: str = engine) -> float:
                 clock = time.perf_counter()
                 find_descend(engine)(
                     parameters,
                     stage.offsets(*problem.start.size),
                     problem.capture,
-                    iterations=counts[engine],
+                    iterations=iterations,
                     rates=stage.rates.moving(),
                 )
-                # An iteration is an evaluation and a step; the last evaluation makes one more.
-                each = (time.perf_counter() - clock) / (counts[engine] + 1)
+                return time.perf_counter() - clock
+
+            with peak_memory() as memory:
+                # What a stage pays once (packing, first touch of its memory) is in both.
+                once = seconds_of(0)
+                each = max(seconds_of(counts[engine]) - once, 1e-9) / counts[engine]
             turns.memory_mib[engine] = memory()
             if turn > 0:
                 turns.milliseconds[engine].append(1e3 * each)
