@@ -35,6 +35,7 @@ from refine.request import ESTIMATED, Request, enough_memory
 USER_ERROR, INTERRUPTED = 2, 130
 
 SUBCOMMANDS: dict[str, str] = {
+    "completion": "refine.completion:app",
     "export": "refine.export.cli:app",
     "view": "refine.viewer.cli:app",
     "video": "refine.video.cli:app",
@@ -77,7 +78,7 @@ def _version(asked: bool) -> bool:
 def fit(
     photos: Annotated[
         list[Path],
-        typer.Argument(metavar="PHOTO", help="JPEG, PNG, TIFF, EXR; or a folder", show_default=False),
+        typer.Argument(metavar="PHOTO", hidden=True, show_default=False),  # said in the text: a panel less
     ],
     light: Annotated[str, _surface("X,Y,Z", "Position of the flash (estimated)")] = ESTIMATED,
     falloff: Annotated[str | None, _surface("NAME", "(none), inverse_square, auto")] = None,
@@ -122,10 +123,10 @@ def fit(
 ) -> None:
     """Turn flash photos of a flat surface into a relightable material.
 
-    Writes <photo>_normal.png, four more images, <photo>.json and a report;
-    of a folder, or with --out of several photos, for each, and an index.
-    Defaults are in parentheses; --one-surface is collocated, inverse_square.
-    More commands: refine export, view, video; each has --help.
+    Every PHOTO (JPEG, PNG, TIFF, EXR; or those of a folder) becomes maps, JSON
+    and a report. Defaults in (); --one-surface is collocated, inverse_square.
+    Example: refine wall.jpg --export gltf, or refine photos/ --out materials
+    Commands: refine export, view, video, completion; each has --help.
     """
     given, folders = photos, any(photo.is_dir() for photo in photos)
     batch = not one_surface and (folders or len(photos) > 1)

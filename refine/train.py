@@ -102,6 +102,8 @@ def train(
 
     Writes `weights.safetensors` (moving average), `state.pt`, `log.jsonl`, `samples.png` and a TensorBoard
     log to `<out>/<stage>/`.
+
+    Example: refine-train --config configs/narrow.yaml --data runs/pool --out runs/mine --stage l1
     """
     try:
         # Everything that can be wrong is looked at first: before any process starts, and any hour is spent.

@@ -46,6 +46,7 @@ def export(
     """Write a material for other programs.
 
     FOLDER is what refine wrote. Defaults are in parentheses.
+    Example: refine export wall_material --to gltf,blender
     """
     if Path(FOLDER).is_file() and not quiet:
         print(

@@ -35,6 +35,7 @@ def view(
 
     FOLDERs are what refine wrote. The page is served to this machine alone
     until Ctrl-C; with --html it is one file that needs no network.
+    Example: refine view wall_material leather_material --html gallery.html
     """
     if html is not None and html.suffix.lower() not in (".html", ".htm"):
         raise UserError(f"--html {html} is not the name of a page; end it in .html.")
