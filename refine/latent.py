@@ -13,15 +13,14 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from nets.baselines.autoencoder import Autoencoder
+from nets.baselines.autoencoder import STEEPEST, Autoencoder
 from nets.checkpoint import load_autoencoder
-from nets.generator import maps_to_svbrdf, svbrdf_to_maps
+from nets.generator import svbrdf_to_maps
 from nets.svbrdf import MAPS, SVBRDF
-from refine.bands import photo_geometry
 from refine.capture import Capture
 from refine.engine import find_gradients
 from refine.engine.reference import Progress
-from refine.parametrization import Parameters
+from refine.parametrization import LOGIT_MARGIN, ROUGHNESS_RANGE, SLOPE_SCALE, Parameters
 from refine.stages import LatentStage, Recipe
 
 BETA2 = 0.999
@@ -62,18 +61,18 @@ def descend_latent(
         nets.checkpoint.CheckpointError: the auto-encoder cannot be loaded.
     """
     network = load_autoencoder(stage.checkpoint).requires_grad_(False).to(start.normal)
+    network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
     size = (start.normal.shape[-2], start.normal.shape[-1])
-    measure = find_gradients(engine)
-    geometries = [photo_geometry(capture) for capture in captures]
+    measure = find_gradients(engine)(start, captures)
     code = encode(network, start.svbrdf()).requires_grad_(True)
     optimizer = torch.optim.Adam([code], lr=stage.rate, betas=(stage.beta1, BETA2))
 
     history: list[float] = []
     best, lowest = start, float("inf")
     for iteration in range(stage.iterations + 1):
-        found = Parameters.from_svbrdf(decode(network, code, size))
+        found = decode(network, code, size)
         here = found.detach()
-        distance, gradients = measure(here, captures, geometries)
+        distance, gradients = measure(here)
         history.append(distance)
         if distance < lowest:
             best, lowest = here, distance
@@ -99,6 +98,19 @@ def encode(network: Autoencoder, svbrdf: SVBRDF) -> Tensor:
     return network.encode(functional.pad(svbrdf_to_maps(svbrdf), more, mode="replicate"))
 
 
-def decode(network: Autoencoder, code: Tensor, size: tuple[int, int]) -> SVBRDF:
-    """Return the material of a code, cut to height and width."""
-    return maps_to_svbrdf(network.decode(code)[..., : size[0], : size[1]])
+def decode(network: Autoencoder, code: Tensor, size: tuple[int, int]) -> Parameters:
+    """Return the parameters of the material of a code, cut to height and width.
+
+    The network's maps are `tanh z`, in [-1, 1]; `(1 + tanh z) / 2` is the logistic curve of `2 z`, so the
+    parameters of albedos are `2 z`. Roughness has another range, and slopes are no logits.
+    """
+    free = network.decode(code)[..., : size[0], : size[1]]
+    slopes, diffuse, roughness, specular = free.split([2, 3, 1, 3], dim=1)
+    low, high = ROUGHNESS_RANGE
+    share = (torch.sigmoid(2.0 * roughness) - low) / (high - low)
+    return Parameters(
+        STEEPEST * torch.tanh(slopes) / SLOPE_SCALE,
+        2.0 * diffuse,
+        torch.logit(share.clamp(LOGIT_MARGIN, 1.0 - LOGIT_MARGIN)),
+        2.0 * specular,
+    )

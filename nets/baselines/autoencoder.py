@@ -73,21 +73,23 @@ class Autoencoder(nn.Module):
         super().__init__()
         self.config = config
         widths = config.encoder_widths
-        self.encoder = nn.ModuleList(
+        down = [
             nn.Conv2d(inputs, outputs, 4, stride=2, padding=1)
             for inputs, outputs in pairwise((sum(CHANNELS.values()), *widths))
-        )
-        self.decoder = nn.ModuleList(
+        ]
+        up = [
             nn.ConvTranspose2d(inputs, outputs, 4, stride=2, padding=1)
             for inputs, outputs in pairwise((*widths[::-1], FREE_CHANNELS))
-        )
-        for convolution in (*self.encoder, *self.decoder):
-            # As loud after a layer as before, or nothing would get through ten of them.
-            fan = convolution.in_channels * 16 / (4 if isinstance(convolution, nn.ConvTranspose2d) else 1)
-            nn.init.normal_(convolution.weight, std=math.sqrt(2.0 / ((1.0 + LEAKY_SLOPE**2) * fan)))
-            nn.init.zeros_(convolution.bias)
+        ]
+        # As loud after a layer as before, or nothing would get through ten of them.
+        for convolutions, products in ((down, 16), (up, 4)):
+            for convolution in convolutions:
+                fan = (1.0 + LEAKY_SLOPE**2) * products * convolution.in_channels
+                nn.init.normal_(convolution.weight, std=math.sqrt(2.0 / fan))
+                nn.init.zeros_(convolution.bias)  # type: ignore[arg-type]
         with torch.no_grad():
-            self.decoder[-1].weight.mul_(LAST_SCALE)
+            up[-1].weight.mul_(LAST_SCALE)
+        self.encoder, self.decoder = nn.ModuleList(down), nn.ModuleList(up)
 
     def encode(self, maps: Float[Tensor, "b 10 h w"]) -> Float[Tensor, "b c h2 w2"]:
         """Return the latent code of maps in [-1, 1], in the order of `MAPS`: a 32nd of their size.
@@ -101,15 +103,15 @@ class Autoencoder(nn.Module):
             x = convolution(functional.leaky_relu(x, LEAKY_SLOPE))
         return x
 
-    def decode(self, latent: Float[Tensor, "b c h w"]) -> Float[Tensor, "b 10 h2 w2"]:
-        """Return the maps in [-1, 1] of a latent code."""
+    def decode(self, latent: Float[Tensor, "b c h w"]) -> Float[Tensor, "b 9 h2 w2"]:
+        """Return the nine free channels of the maps of a latent code, before tanh; see `maps_of`."""
         for convolution in self.decoder:
             latent = convolution(functional.leaky_relu(latent, LEAKY_SLOPE))
-        return maps_of(latent, STEEPEST)
+        return latent
 
     def forward(self, maps: Float[Tensor, "b 10 h w"]) -> Float[Tensor, "b 10 h w"]:
         """Encode and decode maps; errors as `encode`."""
-        return self.decode(self.encode(maps))
+        return maps_of(self.decode(self.encode(maps)), STEEPEST)
 
     @torch.no_grad()
     def reconstruct(self, svbrdf: SVBRDF) -> SVBRDF:

@@ -61,9 +61,9 @@ def find_descend(name: str) -> Callable[..., Any]:
 
 
 def find_gradients(name: str) -> Callable[..., Any]:
-    """Return the `distance_and_gradients` that goes with an engine, see `refine.engine.reference`."""
-    module = ENGINES["fused" if name == "fused" else "reference"]
-    gradients: Callable[..., Any] = import_module(module).distance_and_gradients
+    """Return the `gradients` that goes with an engine, see `refine.engine.reference.gradients`."""
+    module = "fused_gradients" if name == "fused" else "reference"
+    gradients: Callable[..., Any] = import_module(f"refine.engine.{module}").gradients
     return gradients
 
 

@@ -74,27 +74,6 @@ def descend(
         return run(problem, offsets, steps, workers, progress)
 
 
-def distance_and_gradients(
-    start: Parameters,
-    capture: Capture | Sequence[Capture],
-    geometry: Geometry | Sequence[Geometry] | None = None,
-    conventions: Conventions = PAPER,
-) -> tuple[float, dict[str, Float[Tensor, "1 c h w"]]]:
-    """Return the distance, and by map name the gradient of every pixel's own distance by its parameters.
-
-    It is one step of the descent, of rate -1 and without memory, with which clipped pixels move, too: there
-    is no second implementation that could differ.
-    """
-    problem = fused_problem(start, capture, geometry, conventions)
-    problem = replace(problem, moves=torch.ones_like(problem.moves))
-    zeros = {name: torch.zeros_like(getattr(start, name)) for name in MAPS}
-    # offset -= rate first / (sqrt(second) correction + epsilon), with first = gradient
-    steps = np.array([[-1.0] * kernel.PARAMETERS + [0.0, 1.0]])
-    with Workers.of_torch() as workers:
-        gradients, history = _run_pixels(problem, zeros, steps, (0.0, 0.0), workers, None)
-    return history[0], gradients
-
-
 @dataclass(frozen=True)
 class Problem:
     """What is fixed during a descent."""
@@ -271,7 +250,7 @@ def _run_pixels(
     return found, [float(loss) / (3 * problem.pixels) for loss in total]
 
 
-def _pack_spans(problem: Problem, workers: Workers) -> list[Packed]:
+def pack_spans(problem: Problem, workers: Workers) -> list[Packed]:
     """Pack all pixels, in parts of a span as `_run_pixels` does."""
     packed: list[Packed] = []
     for span in problem.spans():
@@ -292,7 +271,7 @@ def _descend_together(
 ) -> tuple[Parameters, list[float]]:
     problem = whole.drawn()
     real = problem.real
-    packed = _pack_spans(problem, workers)
+    packed = pack_spans(problem, workers)
     sums = np.empty((sum(len(part.counts) for part in packed), kernel.PARAMETERS + 1))
     shared = np.zeros(kernel.PARAMETERS)
     moving = np.zeros(kernel.PARAMETERS, dtype=bool)

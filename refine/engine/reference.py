@@ -31,6 +31,10 @@ Progress = Callable[[int, float], None]
 """Called after every iteration with its number (from 1) and loss."""
 
 
+Measure = Callable[[Parameters], tuple[float, dict[str, Tensor]]]
+"""From parameters to the photos' distance and, by map name, its gradient; see `gradients`."""
+
+
 def descend(
     start: Parameters,
     offsets: dict[str, Tensor],
@@ -88,26 +92,34 @@ def descend(
     return objective.moved(best), history
 
 
-def distance_and_gradients(
+def gradients(
     start: Parameters,
     capture: Capture | Sequence[Capture],
     geometry: Geometry | Sequence[Geometry] | None = None,
     conventions: Conventions = PAPER,
-) -> tuple[float, dict[str, Float[Tensor, "1 c h w"]]]:
-    """Return the distance, and by map name the gradient of every pixel's own distance by its parameters.
+) -> Measure:
+    """Return a function from parameters to the photos' distance and its gradient.
 
     Args:
-        start: the parameters.
+        start: parameters of the size and type of those to come.
         capture: as in `descend`.
         geometry: as there.
         conventions: as there.
+
+    Returns:
+        Of the distance, and by map name the gradient of every pixel's own distance by its parameters. Clipped
+        pixels say how theirs should move, too.
     """
-    zeros = {name: torch.zeros_like(getattr(start, name)).requires_grad_(True) for name in MAPS}
-    objective = Objective.of(start, zeros, capture, geometry, conventions)
-    # Clipped pixels say how their parameters should move, too.
-    distance = replace(objective, moves=torch.ones_like(objective.moves)).distance(zeros)
-    gradients = torch.autograd.grad(distance * objective.own_pixels, [zeros[name] for name in MAPS])
-    return float(distance.detach()), dict(zip(MAPS, gradients, strict=True))
+    captures, geometries = several(capture, geometry, conventions)
+
+    def measure(parameters: Parameters) -> tuple[float, dict[str, Float[Tensor, "1 c h w"]]]:
+        zeros = {name: torch.zeros_like(getattr(parameters, name)).requires_grad_(True) for name in MAPS}
+        objective = Objective.of(parameters, zeros, captures, geometries, conventions)
+        distance = replace(objective, moves=torch.ones_like(objective.moves)).distance(zeros)
+        found = torch.autograd.grad(distance * objective.own_pixels, list(zeros.values()))
+        return float(distance.detach()), dict(zip(zeros, found, strict=True))
+
+    return measure
 
 
 def share_of_rate(step: int, iterations: int) -> float:

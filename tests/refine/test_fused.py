@@ -29,7 +29,7 @@ from nets.render import (
 from nets.svbrdf import MAPS
 from refine.capture import Capture
 from refine.engine import compilation, find_descend, fused, kernel, simd
-from refine.engine.fused import distance_and_gradients
+from refine.engine.fused_gradients import gradients
 from refine.parametrization import Parameters
 from refine.run import run_stages
 from refine.stages import GlobalStage, PixelStage, Rates, Recipe
@@ -104,7 +104,7 @@ class Case:
 
     def assert_gradients_agree(self) -> None:
         tolerance = AGREEMENT[self.start.normal.dtype]
-        distance, found = distance_and_gradients(self.start, self.captures, self.geometries, self.conventions)
+        distance, found = gradients(self.start, self.captures, self.geometries, self.conventions)(self.start)
         expected_distance, expected = self.gradients()
         assert distance == pytest.approx(expected_distance, rel=tolerance)
         for name in MAPS:

@@ -17,6 +17,7 @@ from refine.stages import (
     LARGEST_SPEEDUP,
     RECIPES,
     GlobalStage,
+    LatentStage,
     PixelStage,
     PosteriorStage,
     Rates,
@@ -78,7 +79,9 @@ def test_negative_iterations_are_refused(total: int) -> None:
 
 def rebuilt(stage: dict[str, Any]) -> Stage:
     """Read a stage back from plain data."""
-    kind: Any = {kind().name: kind for kind in (GlobalStage, PixelStage, PosteriorStage)}[stage["stage"]]
+    kind: Any = {kind().name: kind for kind in (GlobalStage, LatentStage, PixelStage, PosteriorStage)}[
+        stage["stage"]
+    ]
     parts = {"rates": Rates, "widths": Widths}
     fields = {name: parts[name](**value) if name in parts else value for name, value in stage.items()}
     del fields["stage"]

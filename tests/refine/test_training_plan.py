@@ -4,14 +4,19 @@ from __future__ import annotations
 
 import copy
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import pytest
 import yaml
 
+from losses.baselines import DES18, DES19, GAO19
 from losses.objective import HybridObjective, L1Objective, SyntheticObjective
 from losses.presets import NARROW, PAPER, override
+from nets.baselines.autoencoder import NARROW_AUTOENCODER
+from nets.baselines.des18 import NARROW_DES18
+from nets.baselines.des19 import NARROW_DES19
 from nets.generator import NARROW_GENERATOR, PAPER_GENERATOR
 from nets.training import Phase
 from refine.training_plan import PlanError, Stage, plan_of, read_plan
@@ -25,8 +30,8 @@ CONFIGS = Path(__file__).parent.parent.parent / "configs"
 
 def test_the_paper_s_plan_has_the_paper_s_numbers() -> None:
     plan = read_plan(CONFIGS / "paper.yaml")
-    assert plan.generator == PAPER_GENERATOR
-    assert plan.generator.width == 64
+    assert {stage.network for stage in plan.stages} == {PAPER_GENERATOR}
+    assert PAPER_GENERATOR.width == 64
     assert plan.critics == {"width": 64, "layers": 3, "scales": 2}
     assert [stage.name for stage in plan.stages] == ["maps", "syn", "hyb"]
     assert [stage.trainer.iterations for stage in plan.stages] == [250_000, 200_000, 100_000]
@@ -48,7 +53,7 @@ def test_the_paper_s_plan_has_the_paper_s_numbers() -> None:
 
 def test_the_narrow_plan_is_of_the_network_that_is_shipped() -> None:
     plan = read_plan(CONFIGS / "narrow.yaml")
-    assert plan.generator == NARROW_GENERATOR
+    assert {stage.network for stage in plan.stages} == {NARROW_GENERATOR}
     assert [stage.name for stage in plan.stages] == ["l1", "syn", "hyb"]
     kinds = (L1Objective, SyntheticObjective, HybridObjective)
     for stage, kind in zip(plan.stages, kinds, strict=True):
@@ -57,6 +62,17 @@ def test_the_narrow_plan_is_of_the_network_that_is_shipped() -> None:
     assert plan.stages[1].objective == NARROW.synthetic
     assert plan.stages[2].objective == NARROW
     assert plan.precision == "bf16-mixed"
+
+
+def test_the_plan_of_the_baselines_is_of_the_networks_that_are_shipped() -> None:
+    plan = read_plan(CONFIGS / "baselines.yaml")
+    networks = {"des18": NARROW_DES18, "des19": NARROW_DES19, "gao19": NARROW_AUTOENCODER}
+    assert {stage.name: stage.network for stage in plan.stages} == networks
+    assert [type(stage.network) for stage in plan.stages] == [type(network) for network in networks.values()]
+    assert [stage.objective for stage in plan.stages] == [replace(DES18, map_weight=0.1), DES19, GAO19]
+    narrow = read_plan(CONFIGS / "narrow.yaml")
+    assert plan.shares == narrow.shares
+    assert (plan.augmentation, plan.photography) == (narrow.augmentation, narrow.photography)
 
 
 @pytest.mark.parametrize("path", sorted(CONFIGS.glob("*.yaml")), ids=lambda path: path.name)
@@ -125,12 +141,12 @@ def test_the_good_plan_is_good() -> None:
 
 
 MISTAKES: list[tuple[str, Any, str]] = [
-    ("generator", ABSENT, "the plan lacks generator"),
+    ("generator", ABSENT, "stage syn lacks network, and the plan generator"),
     ("stages", ABSENT, "the plan lacks stages"),
     ("stages", [], "stages must be a list of at least one stage"),
     ("stages", {"a": 1}, "stages must be a list of at least one stage"),
     ("stages", ["soup"], "a stage must be a mapping of names to values, got 'soup'"),
-    ("soup", 1, "the plan has unknown soup; known are generator, stages, critics"),
+    ("soup", 1, "the plan has unknown soup; known are stages, generator, critics"),
     ("generator", None, "generator must be a mapping of names to values, got None"),
     ("generator/soup", 1, "GeneratorConfig has no 'soup'; it has width, levels"),
     ("generator/width", "wide", "GeneratorConfig.width must be of type int, got 'wide'"),
@@ -168,12 +184,20 @@ MISTAKES: list[tuple[str, Any, str]] = [
     ("stages/0/phases/0/soup", 5, "stage syn: a phase has unknown soup; known are iterations, crop, batch"),
     ("stages/0/phases/0/batch", 0, "stage syn: a phase: batch must be a whole number from 1 on, got 0"),
     ("stages/0/phases/0/iterations", 1e5, "iterations must be a whole number from 1 on, got 100000.0"),
-    ("stages/0/phases/0/crop", 20, "stage syn has a crop of 20 pixels; 3 levels need multiples of 8"),
+    ("stages/0/phases/0/crop", 20, "stage syn has a crop of 20 pixels; its network needs multiples of 8"),
     ("stages/0/trainer", {"beta1": 2.0}, "beta1 must be from 0 to below 1, got 2.0"),
     ("stages/0/pairs", 1, "stage syn: pairs must be at least 1 with a hybrid objective and 0 with others"),
     ("stages/1/pairs", 0, "stage hyb: pairs must be at least 1 with a hybrid objective and 0 with others"),
     ("stages/1/pairs", True, "stage hyb: pairs must be at least 1 with a hybrid objective"),
-    ("stages/0/soup", 1, "a stage has unknown soup; known are name, objective, phases, trainer, pairs"),
+    ("stages/0/soup", 1, "a stage has unknown soup; known are name, objective, phases, network"),
+    ("stages/0/network", "des18", "stage syn: network must be a mapping of names to values, got 'des18'"),
+    ("stages/0/network", {"width": 2}, "stage syn: network lacks kind"),
+    ("stages/0/network", {"kind": "soup"}, "no network is called 'soup'; the known ones are generator, des18"),
+    ("stages/0/network", {"kind": "des18", "soup": 1}, "Des18Config has no 'soup'; it has width, levels"),
+    ("stages/0/network", {"kind": "autoencoder", "width": 0}, "not an auto-encoder"),
+    ("stages/0/network", {"kind": "des18"}, "stage syn trains a network of kind des18 on an objective for gen"),
+    ("stages/0/objective", {"kind": "des19"}, "a network of kind generator on an objective for des18 or des19"),
+    ("stages/0/objective", {"kind": "gao19", "preset": "soup"}, "no preset is called 'soup'"),
 ]
 
 
