@@ -17,7 +17,7 @@ from refine.batch.plan import INDEX, LEFTOVERS, RECORD, Job, is_finished, plan
 from refine.batch.processes import work_in_processes
 from refine.batch.view import batch_view
 from refine.batch.work import Opening, remove_leftovers
-from refine.errors import UserError
+from refine.errors import StoppedError, UserError
 from refine.request import Request
 
 FORMAT = "svbrdf-refine batch 1"
@@ -27,12 +27,6 @@ class IncompleteError(UserError):
     """The batch is done, but for photos that failed."""
 
     code = 3
-
-
-class StoppedError(UserError):
-    """The batch was interrupted; what is finished stays."""
-
-    code = 130
 
 
 def refine_batch(
@@ -103,14 +97,23 @@ def refine_batch(
 def _work(
     request: Request, jobs: Sequence[Job], workers: int | None, scheduler: str | None
 ) -> Iterator[tuple[Job, str | None]]:
+    opening = Opening(request, _network(request.init))
     if scheduler is not None:
-        return work_on_cluster(Opening(request), jobs, scheduler)
+        return work_on_cluster(opening, jobs, scheduler)
     return work_in_processes(
-        Opening(request),
+        opening,
         jobs,
         _process_count(request.device) if workers is None else workers,
         meanwhile=lambda: _compile_once(request),
     )
+
+
+def _network(name: str) -> str:
+    """Return a checkpoint's absolute path; the name of a shipped one, which every machine has its own of."""
+    from nets.checkpoint import WEIGHTS, resolve
+
+    path = resolve(name)
+    return name if path.parent == WEIGHTS else os.path.abspath(path)
 
 
 def _process_count(device: str) -> int:

@@ -8,7 +8,7 @@ from __future__ import annotations
 import os
 import shutil
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -29,21 +29,23 @@ class Opening:
 
     Attributes:
         request: the settings.
+        network: the checkpoint, by a name that holds in other folders, too.
     """
 
     request: Request
+    network: str
 
     def __call__(self) -> Bench:
         """Load libraries and network."""
         for variable in THREAD_VARIABLES:
             os.environ.setdefault(variable, str(self.request.threads))
-        return Bench(self.request)
+        return Bench(self.request, self.network)
 
 
 class Bench:
     """The network at hand, for one photo after the other."""
 
-    def __init__(self, request: Request) -> None:
+    def __init__(self, request: Request, network: str) -> None:
         """Load the network.
 
         Raises:
@@ -55,8 +57,8 @@ class Bench:
 
         torch.set_num_threads(request.threads)
         self.request = request
-        self.checkpoint: dict[str, Any] = describe_checkpoint(request.init)
-        self.refiner: Refiner = request.refiner()
+        self.checkpoint: dict[str, Any] = {**describe_checkpoint(network), "name": request.init}
+        self.refiner: Refiner = replace(request, init=network).refiner()
 
     def __call__(self, job: Job) -> str | None:
         """Refine a photo and write its result; return None, or in one sentence why there is none."""
