@@ -15,7 +15,7 @@ from eval.datasets import NOVEL_LIGHTS, SIZE, spread
 from eval.datasets import Protocol as Settings
 from eval.held_out import NAME as BUILT_IN
 from eval.ledger import Ledger
-from eval.methods import METHODS, Method, Row, choose, find_weights, parse_inits
+from eval.methods import METHODS, QUICK_LATENT, Method, Row, choose, find_weights, parse_inits
 from eval.options import (
     MatchExposure,
     NovelLights,
@@ -44,7 +44,9 @@ Out = Annotated[
 Names = Annotated[
     list[str] | None, typer.Option("--rows", help=f"All, or some, comma-separated, of {', '.join(METHODS)}.")
 ]
-Quick = Annotated[bool, typer.Option("--quick", help="8 scenes of Table 1, 3 of Table 2.")]
+Quick = Annotated[
+    bool, typer.Option("--quick", help="8 scenes of Table 1, 3 of Table 2; Gao19 with fewer steps.")
+]
 Inits = Annotated[
     list[str] | None,
     typer.Option("--init", help="ROW=CHECKPOINT: a row's weights, a shipped name or a file."),
@@ -75,7 +77,7 @@ def table1(
     yardsticks = [
         Synthetic(Synthetic.named(name), protocol, estimate_light, flips) for name in sets or [BUILT_IN]
     ]
-    _tables(1, yardsticks, out, rows, _count(1, scenes, quick), init, workers)
+    _tables(1, yardsticks, out, rows, _count(1, scenes, quick), init, workers, quick=quick)
 
 
 def table2(
@@ -96,7 +98,7 @@ def table2(
     with mistakes():
         known = {} if lights is None else read_scene_lights(lights)
     yardsticks = [Real(folder, size, seed, match_exposure, known, flips) for folder in sets]
-    _tables(2, yardsticks, out, rows, _count(2, scenes, quick), init, workers)
+    _tables(2, yardsticks, out, rows, _count(2, scenes, quick), init, workers, quick=quick)
 
 
 def _count(table: int, scenes: int | None, quick: bool) -> int | None:
@@ -111,12 +113,14 @@ def _tables(
     scenes: int | None,
     inits: Sequence[str] | None,
     workers: int,
+    *,
+    quick: bool,
 ) -> None:
     """Compute, print and write one table per test set; end with `INCOMPLETE` if anything is not there."""
     torch.set_num_threads(1)
     with mistakes():
         methods = choose(None if names is None else [name for text in names for name in text.split(",")])
-        rows, gaps = find_weights(methods, parse_inits(inits or []))
+        rows, gaps = find_weights(methods, parse_inits(inits or []), quick=quick)
         sets = [yardstick.name for yardstick in yardsticks]
         if len(set(sets)) < len(sets):
             raise ValueError(f"two test sets are called alike among {', '.join(sets)}; give them one by one")
@@ -157,11 +161,18 @@ def _table(
     caption = (
         f"Table {table} on {yardstick.name}, {count} scenes. {yardstick.caption()} {NARROW}. Weights: "
         f"{', '.join(f'{row.method.name} {row.weights.name} {row.digest[:8]}' for row in rows) or 'none'}. "
+        f"{_shortened(rows)}"
         f"The paper's figures, of other scenes, are in parentheses; the best of ours is bold; "
         f"{' and '.join(made_by) or origin(about)}."
     )
     columns = TABLE1 if table == 1 else TABLE2
     return build(caption, columns, paper_figures(methods, table), run.results, gaps, run.skipped)
+
+
+def _shortened(rows: Sequence[Row]) -> str:
+    """Return a sentence on rows that take fewer steps than they should, or nothing."""
+    names = ", ".join(row.method.name for row in rows if row.shortened)
+    return f"Quick: {names} with {QUICK_LATENT} steps in latent space only. " if names else ""
 
 
 def _write(table: Table, stem: Path) -> None:

@@ -9,6 +9,7 @@ import numpy as np
 import torch
 
 from eval.development import STRIPS
+from nets.baselines.autoencoder import Autoencoder, AutoencoderConfig
 from nets.checkpoint import Record, save_model
 from nets.color import linear_to_srgb
 from nets.data.images import write_image
@@ -35,6 +36,14 @@ def write_checkpoint(path: Path, seed: int = 0) -> Path:
     torch.manual_seed(seed)
     config = GeneratorConfig(width=2, levels=3, deep_multiplier=2)
     save_model(path, Generator(config), Record(config))
+    return path
+
+
+def write_autoencoder(path: Path, seed: int = 0) -> Path:
+    """Write a tiny auto-encoder that was never trained."""
+    torch.manual_seed(seed)
+    config = AutoencoderConfig(width=2)
+    save_model(path, Autoencoder(config), Record(config))
     return path
 
 

@@ -9,17 +9,22 @@ import pytest
 import torch
 
 from eval.datasets import CAMERA
-from eval.methods import METHODS, choose, find_weights, parse_inits
+from eval.methods import METHODS, QUICK_LATENT, choose, find_weights, parse_inits
+from nets import checkpoint
+from nets.baselines.des19 import Des19, Des19Config
+from nets.checkpoint import Record, save_model
 from nets.ensemble import FlipAverage
-from tests.eval_files import write_checkpoint
+from tests.eval_files import write_autoencoder, write_checkpoint
 
 
 def test_rows_are_those_of_the_paper_in_its_order() -> None:
     table = ["Des18", "Des19", "Gao19", "Ours_syn", "Ours_hyb", "Gao19+", "Ours_syn+", "Ours_hyb+"]
     assert list(METHODS) == [*table, "Ours_l1", "Ours_no_render", "Ours_hyb default"]
     assert all(len(METHODS[name].table1) == 6 and len(METHODS[name].table2) == 2 for name in table)
-    assert {name for name in METHODS if METHODS[name].recipe == "paper"} == {n for n in METHODS if "+" in n}
-    assert METHODS["Ours_hyb default"].recipe == "default"
+    recipes = {name: method.recipe for name, method in METHODS.items() if method.recipe}
+    latent = {"Gao19": "gao", "Gao19+": "gao+"}
+    assert recipes == {**latent, "Ours_syn+": "paper", "Ours_hyb+": "paper", "Ours_hyb default": "default"}
+    assert {METHODS[name].checkpoint for name in ("Des19", *latent)} == {"des19"}
 
 
 def test_figures_of_the_paper() -> None:
@@ -76,3 +81,35 @@ def test_a_row_makes_its_refiner(tmp_path: Path) -> None:
     assert (refiner.recipe.name, refiner.resolution, refiner.seed) == ("default", 64, 3)
     assert not isinstance(row.refiner(CAMERA, 64, 3, flips=False).model, FlipAverage)
     assert refiner.fit(torch.rand(3, 64, 64), iters=0).svbrdf.size == (64, 64)
+
+
+def test_gao19_is_a_search_from_des19_in_the_space_of_its_own_weights(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(checkpoint, "WEIGHTS", tmp_path)
+    torch.manual_seed(0)
+    des19 = Des19(Des19Config(width=2, levels=3, deep_multiplier=2))
+    save_model(tmp_path / "des19.safetensors", des19, Record(des19.config))
+    methods = choose(["Des19", "Gao19", "Gao19+"])
+    rows, gaps = find_weights(methods)
+    assert [row.method.name for row in rows] == ["Des19"]
+    assert "gao19: no such checkpoint" in gaps["Gao19"]
+    assert "gao19: no such checkpoint" in gaps["Gao19+"]
+
+    settings = []
+    for seed in (0, 1):
+        write_autoencoder(tmp_path / "gao19.safetensors", seed)
+        rows, gaps = find_weights(methods)
+        assert not gaps
+        settings.append([row.settings() for row in rows])
+    assert settings[0][0] == settings[1][0]
+    assert settings[0][1] != settings[1][1]
+    assert not any(row.shortened for row in rows)
+
+    quick, _ = find_weights(methods, quick=True)
+    assert [row.shortened for row in quick] == [False, True, True]
+    assert quick[1].settings() != rows[1].settings()
+    assert [[stage.iterations for stage in row.recipe.stages] for row in quick if row.recipe] == [
+        [QUICK_LATENT], [QUICK_LATENT, 200],
+    ]  # fmt: skip
+    assert quick[1].refiner(CAMERA, 64, 0, flips=True).recipe == quick[1].recipe
