@@ -64,9 +64,10 @@ SCRIPTS = {"refine", "refine-train", "refine-eval"}
 
 OPTIONS = {
     "refine.cli": "light falloff camera color-space resolution init recipe iters quick seed out format "
-    "normals no-report export json quiet device threads version",
+    "normals no-report export json quiet device threads workers scheduler version",
     "refine.export.cli": "to tile format name out quiet",
     "refine.viewer.cli": "html no-browser quiet",
+    "refine.video.cli": "to path seconds fps size radius height falloff exposure name quiet",
     "refine.train": "config data out pairs stage start resume steps vgg accelerator devices nodes threads "
     "seed save-every data-note",
 }

@@ -287,8 +287,9 @@ def missing(folder: Path, photo: Path) -> list[str]:
     return ["no_such.png"]
 
 
-def a_folder(folder: Path, photo: Path) -> list[str]:
-    return [str(photo.parent)]
+def an_empty_folder(folder: Path, photo: Path) -> list[str]:
+    (folder / "empty").mkdir()
+    return ["empty"]
 
 
 def an_empty_file(folder: Path, photo: Path) -> list[str]:
@@ -373,7 +374,7 @@ def over_the_photo(folder: Path, photo: Path) -> list[str]:
     ("mistake", "hint"),
     [
         (missing, "no_such.png does not exist"),
-        (a_folder, "folder"),
+        (an_empty_folder, "The folder empty holds no photos"),
         (an_empty_file, "bad.png is empty"),
         (text, "bad.png is not an image"),
         (one_pixel, "1 x 1"),
@@ -473,7 +474,7 @@ def test_a_failure_while_writing_leaves_nothing(
     assert listing(here) == []
 
 
-def test_a_terminal_sees_progress_and_control_c_ends_it(
+def test_a_terminal_sees_progress_and_control_c_keeps_the_best_so_far(
     photo: Path, checkpoint: Path, tmp_path: Path
 ) -> None:
     ours, theirs = pty.openpty()
@@ -503,10 +504,16 @@ def test_a_terminal_sees_progress_and_control_c_ends_it(
         while b"interrupted" not in seen:
             seen += os.read(ours, 1024)
         assert process.wait(timeout=60) == 130
+        assert b"interrupted; the best until then is in wall_material." in seen
     os.close(ours)
     assert b"global" in seen
     assert b"Traceback" not in seen
-    assert listing(tmp_path) == []
+    assert set(os.listdir(tmp_path / "wall_material")) == PNG
+    assert read_maps(tmp_path / "wall_material", "wall").size == (40, 64)
+    record = json.loads((tmp_path / "wall_material" / "wall.json").read_text())
+    assert record["interrupted"] is True
+    assert record["losses"]["global"]["iterations"] < 50_000
+    assert record["rmse"]["refined"] <= record["rmse"]["initialization"]
 
 
 def test_the_shipped_checkpoint_is_the_default(photo: Path, here: Path) -> None:
