@@ -82,7 +82,10 @@ def development(
     json_file: JsonFile = None,
     markdown_file: MarkdownFile = None,
 ) -> None:
-    """Score a checkpoint's initialization, and its refinement, on the development sets."""
+    """Score a checkpoint's initialization, and its refinement, on the development sets.
+
+    Example: refine-eval development --data DIR --recipe default --scenes 4
+    """
     _use_threads(threads)
     with mistakes():
         require(data, DEVELOPMENT)
@@ -115,7 +118,10 @@ def ablations(
     json_file: JsonFile = None,
     markdown_file: MarkdownFile = None,
 ) -> None:
-    """Score the default recipe with each of its ingredients taken away, on the development sets."""
+    """Score the default recipe with each of its ingredients taken away, on the development sets.
+
+    Example: refine-eval ablations --data DIR --scenes 8 --lights 8
+    """
     _use_threads(threads)
     with mistakes():
         require(data, DEVELOPMENT)
@@ -145,7 +151,10 @@ def real(
     json_file: JsonFile = None,
     markdown_file: MarkdownFile = None,
 ) -> None:
-    """Score checkpoints on real surfaces in several flash photos of known lights (paper Table 2)."""
+    """Score checkpoints on real surfaces in several flash photos of known lights (paper Table 2).
+
+    Example: refine-eval real DIR --init default --init syn --recipe default
+    """
     _use_threads(threads)
     inits = init or ["default"]
     with mistakes():
@@ -188,7 +197,10 @@ def light(
     json_file: JsonFile = None,
     markdown_file: MarkdownFile = None,
 ) -> None:
-    """Score checkpoints' light heads, alone and after the light fit, on the development sets."""
+    """Score checkpoints' light heads, alone and after the light fit, on the development sets.
+
+    Example: refine-eval light --data DIR --scenes 4
+    """
     _use_threads(threads)
     inits = init or ["default"]
     with mistakes():
@@ -214,7 +226,10 @@ def photos(
     threads: Threads = 0,
     json_file: JsonFile = None,
 ) -> None:
-    """Refine real photos and say whether each is explained, with legal maps."""
+    """Refine real photos and say whether each is explained, with legal maps.
+
+    Example: refine-eval photos DIR wall.jpg --recipe fast --json photos.json
+    """
     _use_threads(threads)
     found = find_photos(folders)
     with mistakes():
@@ -258,7 +273,10 @@ def calibration(
     json_file: JsonFile = None,
     markdown_file: MarkdownFile = None,
 ) -> None:
-    """Score the self-calibration of several photos' lights where they were measured."""
+    """Score the self-calibration of several photos' lights where they were measured.
+
+    Example: refine-eval calibration --data DIR
+    """
     _use_threads(threads)
     with mistakes():
         scenes = measured_scenes(data / "photos/multi_dev")

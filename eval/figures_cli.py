@@ -48,7 +48,10 @@ def figures(
     flips: Annotated[bool, typer.Option(help="Average networks over four mirrored photos.")] = True,
     threads: Annotated[int, typer.Option(min=0, help="CPU threads; 0 leaves torch's choice.")] = 0,
 ) -> None:
-    """The paper's figures 4 to 13: comparisons, ablations, lights, failures."""
+    """The paper's figures 4 to 13: comparisons, ablations, lights, failures.
+
+    Example: refine-eval figures --quick --only 12,13
+    """
     if threads:
         torch.set_num_threads(threads)
     with mistakes():

@@ -72,7 +72,10 @@ def table1(
     flips: Flips = True,
     workers: Workers = 1,
 ) -> None:
-    """The paper's Table 1: maps and renderings against known materials, every row."""
+    """The paper's Table 1: maps and renderings against known materials, every row.
+
+    Example: refine-eval table1 --quick --workers 2
+    """
     protocol = Settings(size=size, lights=lights, seed=seed)
     yardsticks = [
         Synthetic(Synthetic.named(name), protocol, estimate_light, flips) for name in sets or [BUILT_IN]
@@ -94,7 +97,10 @@ def table2(
     flips: Flips = True,
     workers: Workers = 1,
 ) -> None:
-    """The paper's Table 2: one photo of a real surface in, its other photos as the truth, every row."""
+    """The paper's Table 2: one photo of a real surface in, its other photos as the truth, every row.
+
+    Example: refine-eval table2 --set DIR --rows Ours_l1
+    """
     with mistakes():
         known = {} if lights is None else read_scene_lights(lights)
     yardsticks = [Real(folder, size, seed, match_exposure, known, flips) for folder in sets]
