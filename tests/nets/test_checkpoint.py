@@ -16,6 +16,10 @@ from torch import Tensor
 from torch.nn import functional
 
 from nets import checkpoint
+from nets.architectures import NetworkConfig, build, kind_of
+from nets.baselines.autoencoder import Autoencoder, AutoencoderConfig
+from nets.baselines.des18 import Des18Config
+from nets.baselines.des19 import Des19Config
 from nets.checkpoint import (
     FORMAT,
     HEADER_KEY,
@@ -23,7 +27,9 @@ from nets.checkpoint import (
     CheckpointError,
     Record,
     authors_names,
+    load_autoencoder,
     load_model,
+    load_network,
     read_record,
     save_model,
 )
@@ -31,6 +37,7 @@ from nets.generator import Generator, GeneratorConfig
 from tests.helpers import seeded
 
 TINY = GeneratorConfig(width=2, levels=3, deep_multiplier=2)
+OTHERS = (Des18Config(2, 3, 2), Des19Config(2, 3, 2), AutoencoderConfig(2))
 RECORD = Record(TINY, {"iterations": 3}, ["procedural, Apache-2.0"])
 
 
@@ -57,6 +64,41 @@ def test_a_round_trip_keeps_weights_to_half_precision(tmp_path: Path) -> None:
     svbrdf, _ = loaded.predict(torch.rand(1, 3, 16, 16, generator=seeded(0)))
     svbrdf.validate()
     assert [file.name for file in path.parent.iterdir()] == ["own.safetensors"]
+
+
+@pytest.mark.parametrize("config", OTHERS, ids=kind_of)
+def test_networks_of_every_kind_make_the_round_trip(tmp_path: Path, config: NetworkConfig) -> None:
+    network = build(config)
+    path = tmp_path / "other.safetensors"
+    record = Record(config, {"iterations": 2})
+    save_model(path, network, record)
+    assert read_record(path) == record
+    loaded = load_network(path)
+    assert type(loaded) is type(network)
+    assert loaded.config == config
+    for name, value in network.state_dict().items():
+        assert torch.equal(loaded.state_dict()[name], value.half().float()), name
+
+
+def test_auto_encoders_and_networks_of_photos_are_not_taken_for_each_other(
+    saved: Path, tmp_path: Path
+) -> None:
+    config = AutoencoderConfig(width=2)
+    path = tmp_path / "materials.safetensors"
+    save_model(path, Autoencoder(config), Record(config))
+    assert load_autoencoder(path).config == config
+    assert_refused(path, "an auto-encoder of materials, which says nothing of a photo")
+    with pytest.raises(CheckpointError, match="a network of photos, not an auto-encoder") as caught:
+        load_autoencoder(saved)
+    assert "\n" not in str(caught.value)
+
+
+def test_files_of_before_there_were_kinds_are_generators(saved: Path) -> None:
+    def look(tensors: dict[str, Tensor], header: dict[str, Any]) -> None:
+        assert "kind" not in header
+
+    saved.write_bytes(rewritten(saved, look))
+    assert read_record(saved).architecture == load_model(saved).config == TINY
 
 
 def test_the_record_comes_back(saved: Path) -> None:
@@ -331,6 +373,19 @@ def _other_format(tensors: dict[str, Tensor], header: dict[str, Any]) -> None:
     header["format"] = "svbrdf-refine generator 99"
 
 
+def _other_kind(tensors: dict[str, Tensor], header: dict[str, Any]) -> None:
+    header["kind"] = "des20"
+
+
+def _no_kind(tensors: dict[str, Tensor], header: dict[str, Any]) -> None:
+    header["kind"] = ["des18"]
+
+
+def _confused_kind(tensors: dict[str, Tensor], header: dict[str, Any]) -> None:
+    header["kind"] = "des18"
+    header["architecture"] = {"width": 2, "levels": 3, "deep_multiplier": 2}
+
+
 def _no_architecture(tensors: dict[str, Tensor], header: dict[str, Any]) -> None:
     del header["architecture"]
 
@@ -347,6 +402,9 @@ SPOILED = [
     (_enormous, "another architecture, no generator can be built"),
     (_unknown_option, "not a network of this library"),
     (_other_format, "not a network of this library"),
+    (_other_kind, "another architecture, 'des20'; the known ones are generator, des18"),
+    (_no_kind, "not a network of this library"),
+    (_confused_kind, "another architecture, unet.first.weight is missing"),
     (_no_architecture, "not a network of this library"),
 ]
 
