@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import functools
 import threading
-from collections.abc import Iterator, Sequence
+from collections.abc import Generator, Sequence
 
 from refine.batch.plan import Job
 from refine.batch.work import Bench, Opening
@@ -19,7 +19,9 @@ PATIENCE = 10.0
 _ONE_AT_A_TIME = threading.Lock()
 
 
-def work_on_cluster(opening: Opening, jobs: Sequence[Job], address: str) -> Iterator[tuple[Job, str | None]]:
+def work_on_cluster(
+    opening: Opening, jobs: Sequence[Job], address: str
+) -> Generator[tuple[Job, str | None], None, None]:
     """Yield every job with its outcome (None, or why it failed) as soon as it is there.
 
     Jobs that have not begun are withdrawn when the iterator is closed or raises.

@@ -12,7 +12,7 @@ import os
 import signal
 import threading
 from collections import Counter, deque
-from collections.abc import Callable, Hashable, Iterator, Sequence
+from collections.abc import Callable, Generator, Hashable, Iterator, Sequence
 from contextlib import contextmanager
 from multiprocessing.connection import Connection, wait
 from typing import Generic, TypeVar
@@ -37,7 +37,7 @@ def work_in_processes(
     workers: int,
     *,
     meanwhile: Callable[[], object] = lambda: None,
-) -> Iterator[tuple[J, str | None]]:
+) -> Generator[tuple[J, str | None], None, None]:
     """Yield every job with its outcome as soon as it is there.
 
     All processes have ended when the iterator is exhausted, closed or has raised. They do not outlive this
@@ -61,7 +61,8 @@ def work_in_processes(
         while crew:
             for connection in wait([worker.connection for worker in crew]):
                 place = next(n for n, worker in enumerate(crew) if worker.connection is connection)
-                worker, outcomes = crew[place], []
+                worker = crew[place]
+                outcomes: list[tuple[J, str | None]] = []
                 try:
                     outcomes.append((worker.job, worker.answer()))
                 except EOFError:

@@ -6,7 +6,8 @@ import json
 import os
 import sys
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Generator, Mapping, Sequence
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -68,8 +69,11 @@ def refine_batch(
     _write(out, jobs, outcomes, settings)
     stopped = False
     try:
-        with batch_view(len(jobs), known, quiet=quiet) as tell:
-            for job, reason in _work(request, waiting, workers, scheduler):
+        with (
+            batch_view(len(jobs), known, quiet=quiet) as tell,
+            closing(_work(request, waiting, workers, scheduler)) as work,
+        ):
+            for job, reason in work:
                 outcomes[job] = reason
                 tell(job.source, reason)
     except KeyboardInterrupt:
@@ -96,7 +100,7 @@ def refine_batch(
 
 def _work(
     request: Request, jobs: Sequence[Job], workers: int | None, scheduler: str | None
-) -> Iterator[tuple[Job, str | None]]:
+) -> Generator[tuple[Job, str | None], None, None]:
     opening = Opening(request, _network(request.init))
     if scheduler is not None:
         return work_on_cluster(opening, jobs, scheduler)

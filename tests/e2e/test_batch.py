@@ -24,7 +24,7 @@ from refine.maps import read_maps
 from tests.e2e.pictures import flash_photo, save_picture
 
 ROOT = Path(__file__).parents[2]
-PATIENCE = 300.0
+PATIENCE = 900.0
 OPTIONS = ("--resolution", "32", "--iters", "2", "--no-report")
 MAPS = ("diffuse.png", "normal.png", "rendering.png", "roughness.png", "specular.png", "thumbnail.jpg")
 
@@ -66,7 +66,7 @@ def tried(monkeypatch: pytest.MonkeyPatch) -> list[str]:
 
     def no_work(opening: object, jobs: list[Job], *_: object, **__: object) -> Iterator[tuple[Job, None]]:
         names.extend(job.name for job in jobs)
-        return iter(())
+        yield from ()
 
     monkeypatch.setattr(refine.batch.run, "work_in_processes", no_work)
     return names

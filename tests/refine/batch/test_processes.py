@@ -61,7 +61,7 @@ def test_without_jobs_nothing_is_started() -> None:
 def test_closing_ends_the_processes(tmp_path: Path) -> None:
     outcomes = work_in_processes(Toys(tmp_path), ["one", "sleep", "two"], 1)
     assert next(outcomes) == ("one", None)
-    outcomes.close()  # type: ignore[attr-defined]
+    outcomes.close()
     (process,) = processes(tmp_path)
     assert not is_running(process)
     assert not (tmp_path / "two-0").exists()
