@@ -33,6 +33,24 @@ STAGES: dict[str, dict[str, Any]] = {
         "phases": PHASES,
         "pairs": 1,
     },
+    "des18": {
+        "name": "des18",
+        "network": {"kind": "des18", **GENERATOR},
+        "objective": {"kind": "des18"},
+        "phases": PHASES,
+    },
+    "des19": {
+        "name": "des19",
+        "network": {"kind": "des19", **GENERATOR},
+        "objective": {"kind": "des19"},
+        "phases": PHASES,
+    },
+    "gao19": {
+        "name": "gao19",
+        "network": {"kind": "autoencoder", "width": 2},
+        "objective": {"kind": "gao19"},
+        "phases": [{"iterations": 4, "crop": 32, "batch": 2}],
+    },
 }
 
 

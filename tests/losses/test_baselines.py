@@ -109,7 +109,7 @@ def test_terms_and_weights_are_what_they_are_said_to_be(batch: TrainingBatch) ->
     found = ask(GAO19, estimate, batch)
     for name in MAPS:
         assert_close(found.terms[name], plain[name])
-    assert_close(found.generator, sum(found.terms[name] for name in (*MAPS, "rendering")))
+    assert_close(found.generator, torch.stack([found.terms[name] for name in (*MAPS, "rendering")]).sum())
 
     found = ask(DES19, estimate, batch)
     for name in ("diffuse", "specular"):

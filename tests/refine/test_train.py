@@ -16,7 +16,8 @@ import pytest
 import torch
 from typer.testing import CliRunner
 
-from nets.checkpoint import load_model, read_record
+from nets.architectures import kind_of
+from nets.checkpoint import load_model, load_network, read_record
 from nets.data.augment import Augmentation
 from nets.data.materials import PoolMaterials
 from nets.data.pairs import PhotoPairs
@@ -87,7 +88,7 @@ def lines_of(folder: Path) -> list[dict[str, Any]]:
 
 
 def weights_of(folder: Path) -> dict[str, torch.Tensor]:
-    return load_model(folder / "weights.safetensors").state_dict()
+    return load_network(folder / "weights.safetensors").state_dict()
 
 
 def flat(value: Any, name: str = "") -> dict[str, Any]:
@@ -297,6 +298,23 @@ def test_steps_stop_a_training_as_if_interrupted(command: Command, tmp_path: Pat
     assert [done[name]["iteration"] for name in ("l1", "syn")] == [4, 3]
     assert command(*plan, "--resume", out="parts") == (0, "")
     assert_same_training(tmp_path / "whole" / "syn", tmp_path / "parts" / "syn")
+
+
+def test_the_baselines_train_each_from_its_own_start_and_resume(command: Command, tmp_path: Path) -> None:
+    names = ("des18", "des19", "gao19")
+    plan = ("--config", write_plan(tmp_path / "plan.yaml", *(STAGES[name] for name in names)))
+    assert command(*plan, out="whole") == (0, "")
+    assert command(*plan, "--stage", "gao19", out="alone") == (0, "")
+    assert_same_training(tmp_path / "whole" / "gao19", tmp_path / "alone" / "gao19")
+    assert command(*plan, "--steps", "10", out="parts") == (0, "")
+    assert command(*plan, "--resume", out="parts") == (0, "")
+    for name in names:
+        assert_same_training(tmp_path / "whole" / name, tmp_path / "parts" / name)
+        record = read_record(tmp_path / "whole" / name / "weights.safetensors")
+        assert kind_of(record.architecture) == STAGES[name]["network"]["kind"]
+        sheet = oiio.ImageBuf(str(tmp_path / "whole" / name / "samples.png")).spec()
+        assert sheet.width == 6 * STAGES[name]["phases"][0]["crop"]
+    assert set(lines_of(tmp_path / "whole" / "gao19")[-1]["validation"]) == {"loss", "rendering", *MAPS}
 
 
 def test_the_log_has_a_line_of_json_now_and_then(
