@@ -26,6 +26,10 @@ from eval.datasets import CAMERA, input_photo, novel_lights, strip_scenes
 from eval.metrics import SceneScores, evaluate_material, map_rmse, rendering_lpips, rendering_rmse
 from losses.perceptual import LPIPS
 from losses.refinement import photo_distance
+from nets.architectures import NetworkConfig, build
+from nets.baselines.autoencoder import NARROW_AUTOENCODER, PAPER_AUTOENCODER
+from nets.baselines.des18 import NARROW_DES18, PAPER_DES18
+from nets.baselines.des19 import NARROW_DES19, PAPER_DES19
 from nets.color import gamma_encode, to_network_input
 from nets.data.augment import Pose, view_tile
 from nets.data.images import resize
@@ -1178,9 +1182,19 @@ def test_modules_of_the_architecture_page() -> None:
 
 
 def test_sizes_of_the_architecture_page() -> None:
-    for config, words in ((PAPER_GENERATOR, "231.8 M"), (NARROW_GENERATOR, "3.68 M")):
+    sizes: tuple[tuple[NetworkConfig, str], ...] = (
+        (PAPER_GENERATOR, "231.8 M"),
+        (NARROW_GENERATOR, "3.68 M"),
+        (PAPER_DES18, "79.98 M"),
+        (NARROW_DES18, "1.249 M"),
+        (PAPER_DES19, "80.25 M"),
+        (NARROW_DES19, "1.262 M"),
+        (PAPER_AUTOENCODER, "13.92 M"),
+        (NARROW_AUTOENCODER, "0.220 M"),
+    )
+    for config, words in sizes:
         with torch.device("meta"):
-            count = sum(parameter.numel() for parameter in Generator(config).parameters())
+            count = sum(parameter.numel() for parameter in build(config).parameters())
         number, digits = float(words.split()[0]), len(words.split()[0].partition(".")[2])
         assert round(count / 1e6, digits) == number
         assert words in ARCHITECTURE.read_text()
