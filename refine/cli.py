@@ -28,7 +28,7 @@ from refine.arguments import (
 )
 from refine.batch.plan import find_photos
 from refine.console import progress_bar, summarise
-from refine.errors import UserError
+from refine.errors import StoppedError, UserError
 from refine.export.targets import parse_targets
 from refine.request import ESTIMATED, Request, enough_memory
 
@@ -161,6 +161,7 @@ def fit(
     from refine.engine import ENGINES, obstacle
     from refine.export.cli import export_folder
     from refine.photo import ColorSpaceChoice
+    from refine.refiner import Interrupted
     from refine.result import MAP_FORMATS, describe, describe_checkpoint, write_result
     from refine.stages import RECIPES
 
@@ -212,7 +213,10 @@ def fit(
     refiner = request.refiner()
     flash = request.flash(photos)
     with progress_bar(shown=not quiet and sys.stderr.isatty()) as progress, enough_memory(), _log(quiet):
-        refined = request.fit(refiner, reads, flash, progress)
+        try:
+            refined = request.fit(refiner, reads, flash, progress)
+        except Interrupted as stop:
+            refined = stop.refined
         record = describe(refined, output, settings=request.settings(), checkpoint=checkpoint, photo=reads[0])
         paths = write_result(refined, output, record)
     if as_json:
@@ -220,6 +224,8 @@ def fit(
         print()
     if not quiet:
         summarise(record, paths, estimated=flash is None)
+    if refined.interrupted:
+        raise StoppedError(f"interrupted; the best until then is in {output.folder}.")
     if targets:
         export_folder(output.folder, targets, name=output.stem, quiet=quiet)
 

@@ -14,3 +14,9 @@ class UserError(ValueError):
     def __init__(self, sentence: str) -> None:
         """Take the sentence."""
         super().__init__(printable(sentence))
+
+
+class StoppedError(UserError):
+    """Ctrl-C ended the work early; the sentence says what there is of it."""
+
+    code = 130

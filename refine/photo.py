@@ -144,6 +144,15 @@ def photo_from_array(
     return _linear_photo(lambda rows: pixels[rows], size, space or SRGB, integer, notes, "array")
 
 
+def as_photo(img: str | Path | Photo | np.ndarray | Tensor, color_space: ColorSpaceChoice = "auto") -> Photo:
+    """Read a file, take an array, or return a photo as it is; arguments and errors as above."""
+    if isinstance(img, Photo):
+        return img
+    if isinstance(img, str | Path):
+        return read_photo(img, color_space=color_space)
+    return photo_from_array(img, color_space=color_space)
+
+
 def resize_photo(photo: Photo, longer_side: int) -> Photo:
     """Shrink a photo so that its longer side has `longer_side` pixels, keeping its aspect.
 

@@ -29,8 +29,8 @@ from refine.initialization import Predict, Predictor, initialize
 from refine.latent import require_weights
 from refine.light import FalloffChoice, check_falloff, fit_light, fit_light_and_falloff
 from refine.maps import MapFormat, NormalConvention, write_maps
-from refine.photo import ColorSpaceChoice, Photo, photo_from_array, read_photo, resize_photo
-from refine.run import Report, run_stages
+from refine.photo import ColorSpaceChoice, Photo, as_photo, resize_photo
+from refine.run import Report, StagesStopped, run_stages
 from refine.several import complete, find_lights, initialize_together
 from refine.stages import Recipe, find_recipe
 from refine.uncertainty import deviations
@@ -59,6 +59,7 @@ class Refined:
         settings: what else is worth knowing of how it was made.
         engine: that ran the stages, see `refine.engine`.
         others: further photos of the surface, each with its light; `capture` is the first.
+        interrupted: whether Ctrl-C ended the stages early; the maps are the best until then.
     """
 
     svbrdf: SVBRDF
@@ -74,6 +75,7 @@ class Refined:
     settings: dict[str, Any] = field(default_factory=dict)
     engine: str = "reference"
     others: tuple[Capture, ...] = ()
+    interrupted: bool = False
 
     def render(self, light: PointLight | None = None, camera: Camera | None = None) -> Tensor:
         """Render the refined maps, linear `[1, 3, H, W]`; defaults to the photo's light and camera."""
@@ -110,6 +112,19 @@ class Refined:
             format=format,
             normal_convention=normal_convention,
         )
+
+
+class Interrupted(KeyboardInterrupt):
+    """Ctrl-C ended the stages early.
+
+    Attributes:
+        refined: the best until then.
+    """
+
+    def __init__(self, refined: Refined) -> None:
+        """Keep what was reached."""
+        super().__init__()
+        self.refined = refined
 
 
 class Refiner:
@@ -190,12 +205,13 @@ class Refiner:
 
         Raises:
             refine.errors.UserError: if the photo cannot be read or used.
+            Interrupted: Ctrl-C was pressed during the stages; it holds the best until then.
             ValueError: if `iters` is negative, or for an unknown falloff.
         """
         check_falloff(falloff)
         torch.manual_seed(self.seed)
         recipe = self.recipe if iters is None else self.recipe.with_iterations(iters)
-        photo = self._resized(_photo(img, color_space))
+        photo = self._resized(as_photo(img, color_space))
         capture = self._capture(photo, self.camera, light)
         seconds: dict[str, float] = {}
 
@@ -212,20 +228,8 @@ class Refiner:
             seconds["light"] = time.perf_counter() - clock
         light = light or guess
         capture = replace(capture, light=light)
-        svbrdf, losses = run_stages(initial, capture, recipe, seconds, progress, self.engine)
-        return Refined(
-            svbrdf.detach(),
-            initial,
-            light,
-            self.camera,
-            capture,
-            losses,
-            seconds,
-            recipe,
-            photo.notes,
-            photo.source,
-            engine=self.engine,
-        )
+        notes = photo.notes
+        return self._explain(initial, (capture,), self.camera, recipe, seconds, notes, photo.source, progress)
 
     def fit_many(
         self,
@@ -259,6 +263,7 @@ class Refiner:
 
         Raises:
             refine.errors.UserError: a photo cannot be read or used, sizes differ, or alignment fails.
+            Interrupted: as in `fit`.
             ValueError: if `iters` is negative, for an unknown falloff, or for another number of lights.
         """
         check_falloff(falloff)
@@ -269,7 +274,7 @@ class Refiner:
         torch.manual_seed(self.seed)
         recipe = find_recipe("several") if self.recipe == find_recipe(DEFAULT_RECIPE) else self.recipe
         recipe = recipe if iters is None else recipe.with_iterations(iters)
-        photos = [self._resized(_photo(img, color_space)) for img in imgs]
+        photos = [self._resized(as_photo(img, color_space)) for img in imgs]
         seconds: dict[str, float] = {}
 
         clock = time.perf_counter()
@@ -291,21 +296,47 @@ class Refiner:
         seconds["lights"] = time.perf_counter() - clock
         lit = [replace(capture, light=light) for capture, light in zip(captures, found, strict=True)]
         lit = [complete(capture, seen, initial) for capture, seen in zip(lit, visible, strict=True)]
-        svbrdf, losses = run_stages(initial, lit, recipe, seconds, progress, self.engine)
-        return Refined(
+        notes = (*photos[0].notes, f"the first of {len(photos)} photos of one surface")
+        camera, source = self.camera_of_several, photos[0].source
+        return self._explain(initial, tuple(lit), camera, recipe, seconds, notes, source, progress)
+
+    def _explain(
+        self,
+        initial: SVBRDF,
+        captures: tuple[Capture, ...],
+        camera: Camera,
+        recipe: Recipe,
+        seconds: dict[str, float],
+        notes: tuple[str, ...],
+        source: str,
+        progress: Report | None,
+    ) -> Refined:
+        """Run the stages on photos whose lights are known, and put everything that is known together."""
+        stopped = False
+        try:
+            svbrdf, losses = run_stages(initial, captures, recipe, seconds, progress, self.engine)
+        except StagesStopped as stop:
+            stopped, svbrdf, losses = True, stop.svbrdf, stop.losses
+        light = captures[0].light
+        assert light is not None
+        refined = Refined(
             svbrdf.detach(),
             initial,
-            found[0],
-            self.camera_of_several,
-            lit[0],
+            light,
+            camera,
+            captures[0],
             losses,
             seconds,
             recipe,
-            (*photos[0].notes, f"the first of {len(photos)} photos of one surface"),
-            photos[0].source,
+            notes,
+            source,
             engine=self.engine,
-            others=tuple(lit[1:]),
+            others=captures[1:],
+            interrupted=stopped,
         )
+        if stopped:
+            raise Interrupted(refined)
+        return refined
 
     def _resized(self, photo: Photo) -> Photo:
         return photo if self.resolution is None else resize_photo(photo, self.resolution)
@@ -315,11 +346,3 @@ class Refiner:
         unsaturated = photo.unsaturated & (photo.linear < 1.0).all(dim=1, keepdim=True)
         linear = photo.linear.clamp(max=1.0).to(self.device)
         return Capture(linear, unsaturated.to(self.device), camera, light, photo.notes, photo.source)
-
-
-def _photo(img: str | Path | Photo | np.ndarray | Tensor, color_space: ColorSpaceChoice) -> Photo:
-    if isinstance(img, Photo):
-        return img
-    if isinstance(img, str | Path):
-        return read_photo(img, color_space=color_space)
-    return photo_from_array(img, color_space=color_space)

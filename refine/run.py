@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable, Sequence
 
@@ -9,7 +10,7 @@ from nets.svbrdf import SVBRDF
 from refine.bands import distance_in_bands
 from refine.capture import Capture
 from refine.engine import choose_engine, find_descend, find_solve
-from refine.engine.reference import Progress
+from refine.engine.reference import Progress, Stopped
 from refine.latent import descend_latent
 from refine.parametrization import Parameters
 from refine.stages import LatentStage, PosteriorStage, Recipe, Stage
@@ -42,10 +43,11 @@ def run_stages(
     Returns:
         The material and the losses of every stage. If the recipe has no iterations, or a material at the very
         ends of its range (`refine.parametrization`) explains the photos better than what the stages found,
-        it is the initialization itself, untouched.
+        it is the initialization itself, untouched; but not after a latent stage.
 
     Raises:
         ValueError: a light is missing.
+        StagesStopped: it was interrupted; it holds the best so far.
     """
     photos = [captures] if isinstance(captures, Capture) else list(captures)
     device = initial.normal.device
@@ -67,11 +69,38 @@ def run_stages(
             if progress is not None:
                 progress(name, before + iteration, recipe.iterations, loss)
 
-        parameters, losses[label] = _run_stage(stage, parameters, photos, tell, engine)
+        try:
+            parameters, losses[label] = _run_stage(stage, parameters, photos, tell, engine)
+        except KeyboardInterrupt as interrupt:
+            if isinstance(interrupt, Stopped):
+                parameters, losses[label] = interrupt.parameters, interrupt.history
+            seconds[label] = time.perf_counter() - clock
+            raise StagesStopped(_better(initial, parameters, photos, start), losses) from None
+        if isinstance(stage, LatentStage):
+            # It left the initialization for what a decoder can make, which may well explain the photos worse.
+            start = math.inf
         finished += stage.iterations
         seconds[label] = time.perf_counter() - clock
+    return _better(initial, parameters, photos, start), losses
+
+
+class StagesStopped(KeyboardInterrupt):
+    """A recipe was interrupted.
+
+    Attributes:
+        svbrdf: the best so far: of the last stage that is done, or of the one at work if its engine can say.
+        losses: of the stages so far.
+    """
+
+    def __init__(self, svbrdf: SVBRDF, losses: dict[str, list[float]]) -> None:
+        """Keep what was reached."""
+        super().__init__()
+        self.svbrdf, self.losses = svbrdf, losses
+
+
+def _better(initial: SVBRDF, parameters: Parameters, photos: Sequence[Capture], start: float) -> SVBRDF:
     refined = parameters.svbrdf()
-    return (initial if _distance(refined, photos) > start else refined), losses
+    return initial if _distance(refined, photos) > start else refined
 
 
 def _distance(svbrdf: SVBRDF, photos: Sequence[Capture]) -> float:

@@ -239,7 +239,7 @@ def _run_pixels(
             )
             layout.unpack_offsets(packed.surface, packed.pixels, found)
 
-        workers.run(work, len(losses))
+        workers.run(work, len(losses), kernel.BLOCK * (count + 1))
         total += losses.sum(axis=0)
         finished = span.stop
         mark = count * finished // problem.pixels

@@ -18,6 +18,9 @@ from refine.engine.reference import Progress
 from refine.engine.workers import Workers
 from refine.parametrization import Parameters
 
+NEWTON_COST = 8
+"""How many times longer one of its steps takes than one of the descent's, about."""
+
 
 def solve(
     start: Parameters,
@@ -67,7 +70,7 @@ def solve(
                 layout.unpack_offsets(packed.surface, packed.pixels, found)
                 layout.unpack(spread, packed.pixels, deviations)
 
-            workers.run(work, len(costs))
+            workers.run(work, len(costs), NEWTON_COST * kernel.BLOCK * (iterations + 1))
             total += costs.sum(axis=0).reshape(total.shape)
             mark = iterations * span.stop // problem.pixels
             if progress is not None:

@@ -35,6 +35,20 @@ Measure = Callable[[Parameters], tuple[float, dict[str, Tensor]]]
 """From parameters to the photos' distance and, by map name, its gradient; see `gradients`."""
 
 
+class Stopped(KeyboardInterrupt):
+    """A descent was interrupted.
+
+    Attributes:
+        parameters: the best so far.
+        history: of the losses, as far as it goes.
+    """
+
+    def __init__(self, parameters: Parameters, history: list[float]) -> None:
+        """Keep what was reached."""
+        super().__init__()
+        self.parameters, self.history = parameters, history
+
+
 def descend(
     start: Parameters,
     offsets: dict[str, Tensor],
@@ -61,6 +75,9 @@ def descend(
 
     Returns:
         The parameters with the lowest loss seen, and the loss before every step and after the last.
+
+    Raises:
+        Stopped: it was interrupted; it holds the best so far.
     """
     objective = Objective.of(start, offsets, capture, geometry, conventions)
     moving = {name: offset.detach().clone().requires_grad_(True) for name, offset in offsets.items()}
@@ -78,17 +95,22 @@ def descend(
             best_loss = loss
             best = {name: value.detach().clone() for name, value in moving.items()}
 
-    for iteration in range(iterations):
-        optimizer.zero_grad(set_to_none=True)
-        loss = objective.distance(moving)
-        keep(float(loss.detach()))
-        (loss * objective.own_pixels).backward()
-        optimizer.step()
-        schedule.step()
-        if progress is not None:
-            progress(iteration + 1, history[-1])
-    with torch.no_grad():
-        keep(float(objective.distance(moving)))
+    try:
+        for iteration in range(iterations):
+            optimizer.zero_grad(set_to_none=True)
+            loss = objective.distance(moving)
+            keep(float(loss.detach()))
+            (loss * objective.own_pixels).backward()
+            optimizer.step()
+            schedule.step()
+            if progress is not None:
+                progress(iteration + 1, history[-1])
+        with torch.no_grad():
+            keep(float(objective.distance(moving)))
+    except KeyboardInterrupt:
+        if not history:
+            raise
+        raise Stopped(objective.moved(best), history) from None
     return objective.moved(best), history
 
 

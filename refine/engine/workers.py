@@ -11,6 +11,9 @@ import torch
 TASKS_PER_THREAD = 4
 """Parts of the work per thread: a core that is busy elsewhere holds up the others by a part only."""
 
+LONGEST_TASK = 2**23
+"""Most pixels times steps of a part, a quarter of a second or so: compiled loops do not hear Ctrl-C."""
+
 
 class Workers:
     """A pool of threads, used only while it is open.
@@ -31,8 +34,11 @@ class Workers:
         with ThreadPoolExecutor(threads, thread_name_prefix="refine") as pool:
             yield Workers(pool, threads)
 
-    def run(self, work: Callable[[slice], None], length: int) -> None:
-        """Do `work` on all parts of a range of this length; raises what any of them raises."""
-        size = max(1, -(-length // self.tasks))
+    def run(self, work: Callable[[slice], None], length: int, cost: int = 1) -> None:
+        """Do `work` on all parts of a range of this length; raises what any of them raises.
+
+        `cost` is what one of the range takes, in pixels times steps; parts are no larger than `LONGEST_TASK`.
+        """
+        size = max(1, min(-(-length // self.tasks), LONGEST_TASK // cost))
         for _ in self.pool.map(work, (slice(first, first + size) for first in range(0, length, size))):
             pass
