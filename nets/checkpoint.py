@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import pickle
 import warnings
 import zipfile
@@ -22,6 +23,7 @@ from nets.baselines.des18 import Des18
 from nets.baselines.des19 import Des19
 from nets.generator import PAPER_GENERATOR, Generator, GeneratorConfig
 from nets.svbrdf import MAPS
+from nets.text import parse_json, printable
 
 WEIGHTS = Path(__file__).parent / "weights"
 """Folder of the shipped checkpoints."""
@@ -29,12 +31,19 @@ WEIGHTS = Path(__file__).parent / "weights"
 FORMAT = "svbrdf-refine generator 1"
 HEADER_KEY = "svbrdf_refine"
 
+LARGEST_NUMBER = 1024
+"""Widths, levels and so on beyond this are of no network: building it would take for ever."""
+
 AUTHORS_NAMES = {"normal": "normal", "diffuse": "diff", "roughness": "rough", "specular": "spec"}
 """How the authors' state dict calls our maps."""
 
 
 class CheckpointError(ValueError):
     """A checkpoint that cannot be loaded; one sentence that names the file and says why."""
+
+    def __init__(self, sentence: str) -> None:
+        """Take the sentence."""
+        super().__init__(printable(sentence))
 
 
 @dataclass(frozen=True)
@@ -59,9 +68,12 @@ def save_model(path: Path, network: Network, record: Record) -> None:
     header = {"format": FORMAT, "kind": kind_of(record.architecture), **asdict(record)}
     tensors = {name: value.detach().half().contiguous() for name, value in network.state_dict().items()}
     path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_suffix(".partial")
-    temporary.write_bytes(serialize(tensors, metadata={HEADER_KEY: json.dumps(header, sort_keys=True)}))
-    temporary.replace(path)
+    temporary = path.with_suffix(f".{os.getpid()}.partial")
+    try:
+        temporary.write_bytes(serialize(tensors, metadata={HEADER_KEY: json.dumps(header, sort_keys=True)}))
+        temporary.replace(path)
+    finally:
+        temporary.unlink(missing_ok=True)
 
 
 def load_model(name: str | Path = "default") -> Generator | Des18 | Des19:
@@ -129,7 +141,7 @@ def read_record(name: str | Path) -> Record:
             f"{path}: not a safetensors file ({error}); give one written by refine-train"
         ) from None
     try:
-        header = json.loads(metadata[HEADER_KEY])
+        header = parse_json(metadata[HEADER_KEY])
         if header.pop("format") != FORMAT:
             raise KeyError
         # Files of before there were other kinds do not name theirs.
@@ -161,6 +173,7 @@ def _load_own(path: Path) -> Network:
 
 def _load_authors(path: Path) -> Network:
     try:
+        _require_uncompressed(path)
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # about pickles that are refused anyway
             state = torch.load(path, map_location="cpu", weights_only=True)
@@ -191,8 +204,25 @@ def _load_authors(path: Path) -> Network:
     return network
 
 
+def _require_uncompressed(path: Path) -> None:
+    """Refuse an archive that would be larger in memory than on disk: torch never writes one.
+
+    Raises:
+        ValueError: it is one.
+        zipfile.BadZipFile: it is damaged.
+    """
+    if not zipfile.is_zipfile(path):
+        return
+    with zipfile.ZipFile(path) as archive:
+        unpacked = sum(entry.file_size for entry in archive.infolist())
+    if unpacked > path.stat().st_size:
+        raise ValueError(f"it is {path.stat().st_size} bytes that unpack to {unpacked}")
+
+
 def _without_weights(path: Path, kind: str, architecture: Mapping[str, Any]) -> Network:
     try:
+        if any(isinstance(value, int) and value > LARGEST_NUMBER for value in architecture.values()):
+            raise ValueError
         with torch.device("meta"):
             return build(find_config(kind)(**architecture))
     except (RuntimeError, TypeError, ValueError):

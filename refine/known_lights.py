@@ -7,7 +7,6 @@ side spans -1 to 1. A folder is one of MaterialGAN's scenes (`nets.data.photos`)
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Literal
@@ -18,6 +17,7 @@ import torch
 from nets.data.images import DataError
 from nets.data.photos import read_scene
 from nets.render import PointLight
+from nets.text import parse_json
 from refine.errors import UserError
 
 
@@ -50,11 +50,11 @@ def read_lights(
 
 def _of_file(source: Path) -> np.ndarray:  # [photos, 3]
     try:
-        positions = json.loads(source.read_text(encoding="utf-8"))["positions"]
+        positions = parse_json(source.read_text(encoding="utf-8"))["positions"]
         return np.array(positions, dtype=np.float64)
     except OSError as error:
         raise UserError(f"{source} cannot be read: {error.strerror}; give a JSON file or a folder.") from None
-    except (ValueError, KeyError, TypeError):
+    except (ValueError, KeyError, TypeError, OverflowError):
         raise UserError(
             f'{source} does not hold lights; write {{"positions": [[x, y, z], ...]}}, one per photo.'
         ) from None

@@ -86,7 +86,7 @@ def export_folder(
         format=MAP_FORMATS[format],
         tile=tile,
         keep=result.files,
-        origin={"name": result.stem, "photo": result.record.get("photo", {}).get("source")},
+        origin={"name": result.stem, "photo": result.photo},
     )
     if not quiet:
         _summarise(record, paths)

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from nets.svbrdf import SVBRDF
+from nets.text import parse_json
 from refine.errors import UserError
 from refine.maps import MAP_NAMES, read_maps
 from refine.result import FORMAT, MAP_FORMATS
@@ -28,6 +28,13 @@ class Result:
     stem: str
     files: list[Path]
     record: dict[str, Any]
+
+    @property
+    def photo(self) -> str | None:
+        """Where its photo was, if the record says so."""
+        photo = self.record.get("photo")
+        source = photo.get("source") if isinstance(photo, dict) else None
+        return source if isinstance(source, str) else None
 
 
 def read_result(folder: Path, stem: str | None = None) -> Result:
@@ -85,7 +92,7 @@ def _records(folder: Path) -> dict[str, dict[str, Any]]:
 def _record(path: Path) -> dict[str, Any] | None:
     """Return a JSON file's content if it is the record of a result."""
     try:
-        record = json.loads(path.read_text(encoding="utf-8"))
+        record = parse_json(path.read_text(encoding="utf-8"))
     except (OSError, ValueError):
         return None
     return record if isinstance(record, dict) and record.get("format") == FORMAT else None

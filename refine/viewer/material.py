@@ -58,7 +58,7 @@ def describe_material(folder: Path, stem: str) -> dict[str, Any]:
             "source": str(record["photo"]["source"]),
             "rmse": _numbers([record["rmse"][name] for name in ("initialization", "refined")], 2),
         }
-    except (KeyError, TypeError, ValueError, AttributeError) as error:
+    except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as error:
         raise UserError(
             f"{folder / stem}.json does not say how its photo was lit and seen; run refine on it again."
         ) from error
