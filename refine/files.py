@@ -9,13 +9,18 @@ import contextlib
 import os
 import secrets
 import stat
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float32, Shaped
+
+try:
+    import fcntl
+except ImportError:  # Windows
+    fcntl = None  # type: ignore[assignment]
 
 from nets import decoding
 from nets.decoding import Decoded, DecodingError, Limits
@@ -112,14 +117,19 @@ def _sentence(path: Path, error: DecodingError, limits: Limits) -> str:
 
 
 @contextmanager
-def write_together(paths: Sequence[Path | str]) -> Iterator[list[Path]]:
+def write_together(
+    paths: Sequence[Path | str], outdated: Callable[[], Iterable[Path]] = tuple
+) -> Iterator[list[Path]]:
     """Write several files so that either all of them appear, complete, or none does.
 
     Yields temporary siblings of `paths` with the same extensions, already created and empty. When the
     block ends well they are flushed to disk and renamed to `paths`, replacing what was there; when
-    anything is raised they are removed, and so are the folders that were created for them. Of several, the
-    last is taken away before the others are replaced and comes back last: where it is, even after a kill,
-    everything beside it is of the same run.
+    anything is raised they are removed, and so are the folders that were created for them. Two processes
+    that write into one folder rename one after the other.
+
+    Args:
+        paths: of the files.
+        outdated: asked for further files to remove, when it is this process's turn to rename.
 
     Raises:
         UserError: a folder cannot be made or written, a target is a folder, or the disk is full; also
@@ -142,17 +152,19 @@ def write_together(paths: Sequence[Path | str]) -> Iterator[list[Path]]:
         for temporary in temporaries:
             with temporary.open("rb+") as file:
                 os.fsync(file.fileno())
-        if len(targets) > 1:
-            targets[-1].resolve().unlink(missing_ok=True)
-        for current, temporary in zip(targets, temporaries, strict=True):
-            new = not current.exists()
-            os.replace(temporary, current.resolve())
-            if new:
-                appeared.append(current)
+        with _held({temporary.parent for temporary in temporaries}):
+            leftover = list(outdated())
+            for current, temporary in zip(targets, temporaries, strict=True):
+                new = not current.exists()
+                os.replace(temporary, current.resolve())
+                if new:
+                    appeared.append(current)
+            for current in leftover:
+                current.unlink(missing_ok=True)
     except BaseException as error:
-        for leftover in temporaries + appeared:
+        for path in temporaries + appeared:
             with contextlib.suppress(OSError):
-                leftover.unlink(missing_ok=True)
+                path.unlink(missing_ok=True)
         for folder in reversed(created):
             with contextlib.suppress(OSError):
                 folder.rmdir()
@@ -162,6 +174,26 @@ def write_together(paths: Sequence[Path | str]) -> Iterator[list[Path]]:
                 f"Cannot write {current}: {reason}; choose another folder or make room there."
             ) from error
         raise
+
+
+@contextmanager
+def _held(folders: Iterable[Path]) -> Iterator[None]:
+    """Keep other processes out of this block as long as it is about the same folders.
+
+    A folder is its own lock, which leaves nothing behind. Where there are no locks (Windows, some network
+    file systems) nothing is kept out.
+    """
+    with contextlib.ExitStack() as stack:
+        descriptors = []
+        for folder in sorted(folders) if fcntl is not None else ():
+            descriptors.append(os.open(folder, os.O_RDONLY))
+            stack.callback(os.close, descriptors[-1])
+            with contextlib.suppress(OSError):
+                fcntl.flock(descriptors[-1], fcntl.LOCK_EX)
+        yield
+        for descriptor in descriptors:
+            with contextlib.suppress(OSError):
+                os.fsync(descriptor)  # or a power cut could undo the renaming
 
 
 @contextmanager

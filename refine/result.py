@@ -21,6 +21,7 @@ import torch
 
 from nets.checkpoint import read_record, resolve
 from nets.render import PointLight
+from nets.text import parse_json
 from refine import __version__
 from refine.bands import render_in_bands
 from refine.capture import Capture
@@ -135,8 +136,12 @@ def write_result(refined: Refined, output: Output, record: dict[str, Any]) -> di
         UserError: a file cannot be written.
     """
     paths = output.paths()
-    outdated = _files_of_record(paths["json"]) - {path.name for path in paths.values()}
-    with write_together(list(paths.values())) as siblings:
+
+    def outdated() -> list[Path]:
+        names = _files_of_record(paths["json"]) - {path.name for path in paths.values()}
+        return [output.folder / name for name in sorted(names)]
+
+    with write_together(list(paths.values()), outdated) as siblings:
         temporaries = dict(zip(paths, siblings, strict=True))
         with tempfile.TemporaryDirectory(prefix=".refine-", dir=siblings[0].parent) as staging:
             maps = write_maps(
@@ -164,15 +169,13 @@ def write_result(refined: Refined, output: Output, record: dict[str, Any]) -> di
             write_sheet(temporaries["report"], refined, uncertainty=output.uncertainty)
         if output.thumbnail:
             write_thumbnail(temporaries["thumbnail"], refined)
-    for name in outdated:
-        (output.folder / name).unlink(missing_ok=True)
     return paths
 
 
 def _files_of_record(path: Path) -> set[str]:
     """Return the names of the files that an earlier run wrote, as far as they can only be its own."""
     try:
-        record = json.loads(path.read_text(encoding="utf-8"))
+        record = parse_json(path.read_text(encoding="utf-8"))
         names = record["maps"]["files"].values() if record["format"] == FORMAT else ()
     except (OSError, ValueError, KeyError, TypeError, AttributeError):
         return set()
@@ -231,6 +234,7 @@ def describe(
             "files": {name: path.name for name, path in output.paths().items()},
             "encodings": map_encodings(output),
         },
+        **({"interrupted": True} if refined.interrupted else {}),
         "rmse": {
             "measure": "between re-rendering and photo, gamma-encoded (1/2.2), unsaturated pixels",
             "initialization": before,
