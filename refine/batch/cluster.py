@@ -13,7 +13,7 @@ from refine.batch.plan import Job
 from refine.batch.work import Bench, Opening
 from refine.errors import UserError
 
-PATIENCE = 10.0
+PATIENCE = 30.0
 """Seconds in which a scheduler must answer."""
 
 _ONE_AT_A_TIME = threading.Lock()

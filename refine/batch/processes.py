@@ -14,6 +14,7 @@ import threading
 from collections import Counter, deque
 from collections.abc import Callable, Generator, Hashable, Iterator, Sequence
 from contextlib import contextmanager
+from multiprocessing import resource_tracker
 from multiprocessing.connection import Connection, wait
 from typing import Generic, TypeVar
 
@@ -53,7 +54,8 @@ def work_in_processes(
     crew: list[_Worker[J]] = []
     try:
         for _ in range(min(workers, len(jobs))):
-            crew.append(_Worker(opening))
+            with interrupts_held():
+                crew.append(_Worker(opening))
         if crew:
             meanwhile()
         for worker in crew:
@@ -73,7 +75,8 @@ def work_in_processes(
                     else:
                         outcomes.append((worker.job, DIED.format(ATTEMPTS, reason)))
                     if waiting:
-                        worker = crew[place] = _Worker(opening)
+                        with interrupts_held():
+                            worker = crew[place] = _Worker(opening)
                 if waiting:
                     worker.begin(waiting.popleft())
                 else:
@@ -93,8 +96,7 @@ class _Worker(Generic[J]):
         context = multiprocessing.get_context("spawn")  # forks of a process whose libraries have threads hang
         self.connection, theirs = context.Pipe()
         self.process = context.Process(target=_serve, args=(theirs, opening))
-        with _deaf_to_interrupts():
-            self.process.start()
+        self.process.start()
         theirs.close()  # so that its death is the end of the file
 
     def begin(self, job: J) -> None:
@@ -127,7 +129,7 @@ class _Worker(Generic[J]):
 
 def _serve(connection: Connection, opening: Callable[[], Work[J]]) -> None:
     """Answer jobs until the pipe is closed: the whole life of a process."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # it was held back until here
     threading.Thread(target=_end_with_parent, daemon=True).start()
     work = opening()
     with contextlib.suppress(EOFError):
@@ -143,13 +145,14 @@ def _end_with_parent() -> None:
 
 
 @contextmanager
-def _deaf_to_interrupts() -> Iterator[None]:
-    """Let what is started meanwhile ignore Ctrl-C from its first moment: its parent decides what it means."""
-    if threading.current_thread() is not threading.main_thread():
+def interrupts_held() -> Iterator[None]:
+    """Have Ctrl-C wait until the block ends, and what is started meanwhile not hear it at all."""
+    if not hasattr(signal, "pthread_sigmask"):
         yield
         return
-    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    resource_tracker.ensure_running()  # or the first process would start it, which lets Ctrl-C through
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
         yield
     finally:
-        signal.signal(signal.SIGINT, before)
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)

@@ -214,9 +214,12 @@ def test_control_c_ends_all_processes_and_says_how_to_go_on(arguments: list[str]
         command(*slow), env=environment(), stderr=subprocess.PIPE, text=True, preexec_fn=listening,
         start_new_session=True,
     ) as process:  # fmt: skip
-        wait_until((out / "batch.json").exists)
-        os.killpg(process.pid, signal.SIGINT)  # as a terminal does, to all of them
-        _, error = process.communicate(timeout=PATIENCE)
+        try:
+            wait_until((out / "batch.json").exists)
+            os.killpg(process.pid, signal.SIGINT)  # as a terminal does, to all of them
+            _, error = process.communicate(timeout=PATIENCE)
+        finally:
+            process.kill()
     assert process.returncode == 130
     assert error == "refine: interrupted; 0 of 4 photos are done, the same command does the rest.\n"
     assert {entry["state"] for entry in json.loads((out / "batch.json").read_text())["photos"]} == {"waiting"}

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from refine.batch.processes import work_in_processes
+from refine.batch.processes import interrupts_held, work_in_processes
 from tests.refine.batch.toys import Toys
 
 PATIENCE = 60.0
@@ -48,6 +48,14 @@ def test_a_job_whose_process_dies_is_tried_once_more(tmp_path: Path) -> None:
     assert sorted(path.name for path in tmp_path.glob("*e*-[0-9]")) == [
         "die once-0", "die once-1", "die-0", "die-1", "one-0",
     ]  # fmt: skip
+
+
+def test_an_interrupt_at_a_bad_moment_is_late_not_lost() -> None:
+    reached = False
+    with pytest.raises(KeyboardInterrupt), interrupts_held():  # noqa: PT012
+        os.kill(os.getpid(), signal.SIGINT)
+        reached = True
+    assert reached
 
 
 def test_without_jobs_nothing_is_started() -> None:
