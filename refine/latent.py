@@ -7,6 +7,7 @@ autograd.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 import torch
@@ -19,7 +20,7 @@ from nets.generator import svbrdf_to_maps
 from nets.svbrdf import MAPS, SVBRDF
 from refine.capture import Capture
 from refine.engine import find_gradients
-from refine.engine.reference import Progress
+from refine.engine.reference import Progress, Stopped
 from refine.parametrization import LOGIT_MARGIN, ROUGHNESS_RANGE, SLOPE_SCALE, Parameters
 from refine.stages import LatentStage, Recipe
 
@@ -59,6 +60,7 @@ def descend_latent(
 
     Raises:
         nets.checkpoint.CheckpointError: the auto-encoder cannot be loaded.
+        Stopped: it was interrupted; it holds the best so far.
     """
     network = load_autoencoder(stage.checkpoint).requires_grad_(False).to(start.normal)
     network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
@@ -68,24 +70,30 @@ def descend_latent(
     optimizer = torch.optim.Adam([code], lr=stage.rate, betas=(stage.beta1, BETA2))
 
     history: list[float] = []
-    best, lowest = start, float("inf")
-    for iteration in range(stage.iterations + 1):
-        found = decode(network, code, size)
-        here = found.detach()
-        distance, gradients = measure(here)
-        history.append(distance)
-        if distance < lowest:
-            best, lowest = here, distance
-        if iteration == stage.iterations:
-            break
-        optimizer.zero_grad(set_to_none=True)
-        # Engines say how each pixel's own distance changes; the code moves the mean of all.
-        torch.autograd.backward(
-            [getattr(found, name) for name in MAPS], [gradients[name] / (size[0] * size[1]) for name in MAPS]
-        )
-        optimizer.step()
-        if progress is not None:
-            progress(iteration + 1, distance)
+    best, lowest = start, math.inf
+    try:
+        for iteration in range(stage.iterations + 1):
+            found = decode(network, code, size)
+            here = found.detach()
+            distance, gradients = measure(here)
+            if distance < lowest:
+                best, lowest = here, distance
+            history.append(distance)
+            if iteration == stage.iterations:
+                break
+            optimizer.zero_grad(set_to_none=True)
+            # Engines say how each pixel's own distance changes; the code moves the mean of all.
+            torch.autograd.backward(
+                [getattr(found, name) for name in MAPS],
+                [gradients[name] / (size[0] * size[1]) for name in MAPS],
+            )
+            optimizer.step()
+            if progress is not None:
+                progress(iteration + 1, distance)
+    except KeyboardInterrupt:
+        if not history:
+            raise
+        raise Stopped(best, history) from None
     return best, history
 
 

@@ -22,6 +22,7 @@ from refine import Refiner, cli
 from refine.bands import distance_in_bands
 from refine.capture import Capture
 from refine.engine import ENGINES, find_gradients
+from refine.engine.reference import Stopped
 from refine.latent import decode, descend_latent, encode
 from refine.parametrization import Parameters
 from refine.run import run_stages
@@ -146,8 +147,32 @@ def test_the_end_is_never_worse_than_the_start(rate: float, weights: str) -> Non
     )
     assert distance_in_bands(found.svbrdf(), photo) <= history[0] * (1.0 + 1e-5)
     recipe = Recipe("some", stages=(LatentStage(5, rate=rate, checkpoint=weights), PixelStage(4)))
-    refined, _ = run_stages(start, photo, recipe, {})
-    assert distance_in_bands(refined, photo) <= distance_in_bands(start, photo)
+    refined, losses = run_stages(start, photo, recipe, {})
+    assert losses["per-pixel"][0] == pytest.approx(min(losses["latent"]), rel=1e-4)
+    assert distance_in_bands(refined, photo) <= min(losses["latent"])
+
+
+def test_a_better_initialization_does_not_take_the_decoder_s_place(weights: str) -> None:
+    truth = random_svbrdf(1, 24, 40, seed=7)
+    photo, recipe = capture_of(truth), Recipe("some", stages=(LatentStage(3, checkpoint=weights),))
+    refined, losses = run_stages(truth, photo, recipe, {})
+    assert losses["initialization"][0] < 0.5 * min(losses["latent"])
+    assert distance_in_bands(refined, photo) == pytest.approx(min(losses["latent"]), rel=1e-4)
+
+
+def test_an_interrupted_search_keeps_the_best_so_far(weights: str) -> None:
+    photo, start = capture_of(makeable()), Parameters.from_svbrdf(random_svbrdf(1, 24, 40))
+
+    def interrupt(iteration: int, loss: float) -> None:
+        if iteration == 4:
+            raise KeyboardInterrupt
+
+    with pytest.raises(Stopped) as caught:
+        descend_latent(start, [photo], LatentStage(9, rate=0.1, checkpoint=weights), "fused", interrupt)
+    assert len(caught.value.history) == 4
+    assert distance_in_bands(caught.value.parameters.svbrdf(), photo) == pytest.approx(
+        min(caught.value.history), rel=1e-4
+    )
 
 
 def test_only_what_the_decoder_can_make_is_found(tmp_path: Path) -> None:
