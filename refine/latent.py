@@ -112,7 +112,7 @@ def decode(network: Autoencoder, code: Tensor, size: tuple[int, int]) -> Paramet
     The network's maps are `tanh z`, in [-1, 1]; `(1 + tanh z) / 2` is the logistic curve of `2 z`, so the
     parameters of albedos are `2 z`. Roughness has another range, and slopes are no logits.
     """
-    free = network.decode(code)[..., : size[0], : size[1]]
+    free = network.decode(code)[..., : size[0], : size[1]].contiguous()
     slopes, diffuse, roughness, specular = free.split([2, 3, 1, 3], dim=1)
     low, high = ROUGHNESS_RANGE
     share = (torch.sigmoid(2.0 * roughness) - low) / (high - low)
