@@ -124,8 +124,10 @@ def write_together(
 
     Yields temporary siblings of `paths` with the same extensions, already created and empty. When the
     block ends well they are flushed to disk and renamed to `paths`, replacing what was there; when
-    anything is raised they are removed, and so are the folders that were created for them. Two processes
-    that write into one folder rename one after the other.
+    anything is raised they are removed, and so are the folders that were created for them. Of several, the
+    last is taken away before the others are replaced and comes back last: where it is, even after a kill,
+    everything beside it is of the same run. Two processes that write into one folder rename one after the
+    other.
 
     Args:
         paths: of the files.
@@ -154,6 +156,8 @@ def write_together(
                 os.fsync(file.fileno())
         with _held({temporary.parent for temporary in temporaries}):
             leftover = list(outdated())
+            if len(targets) > 1:
+                targets[-1].resolve().unlink(missing_ok=True)
             for current, temporary in zip(targets, temporaries, strict=True):
                 new = not current.exists()
                 os.replace(temporary, current.resolve())

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from nets.text import parse_json
 from refine.errors import UserError
 from refine.request import Request
 
@@ -108,7 +109,7 @@ def plan(photos: Sequence[Path], out: Path) -> list[Job]:
 def read_record(job: Job) -> dict[str, Any] | None:
     """Return the record of a photo's result; None if there is none."""
     try:
-        record = json.loads((job.folder / f"{job.stem}.json").read_text(encoding="utf-8"))
+        record = parse_json((job.folder / f"{job.stem}.json").read_text(encoding="utf-8"))
     except (OSError, ValueError):
         return None
     return record if isinstance(record, dict) else None
@@ -125,7 +126,7 @@ def is_finished(job: Job, request: Request, checkpoint: str) -> bool:
     from refine.result import FORMAT, digest
 
     record = read_record(job)
-    if record is None or record.get("format") != FORMAT:
+    if record is None or record.get("format") != FORMAT or record.get("interrupted"):
         return False
     paths = request.output(job.folder, job.stem).paths()
     expected = {
@@ -150,7 +151,7 @@ def _is_exported(job: Job, request: Request) -> bool:
         return True
     folder = job.folder / "export"
     try:
-        targets = json.loads((folder / f"{job.stem}_export.json").read_text(encoding="utf-8"))["targets"]
+        targets = parse_json((folder / f"{job.stem}_export.json").read_text(encoding="utf-8"))["targets"]
         files = [name for target in request.export for name in targets[target]["files"]]
     except (OSError, ValueError, KeyError, TypeError):
         return False

@@ -137,41 +137,48 @@ def test_what_is_finished_is_not_done_again(
     assert "3 of them before" in capfd.readouterr().err
 
 
-def another_photo(photos: Path, mats: Path) -> None:
+def amend(mats: Path, change: Callable[[dict[str, Any]], object]) -> None:
     record = json.loads((mats / "b" / "b.json").read_text())
-    record["photo"]["sha256"] = "0" * 64
+    change(record)
     (mats / "b" / "b.json").write_text(json.dumps(record))
 
 
-def another_network(photos: Path, mats: Path) -> None:
-    record = json.loads((mats / "b" / "b.json").read_text())
-    record["checkpoint"]["sha256"] = "0" * 64
-    (mats / "b" / "b.json").write_text(json.dumps(record))
+def another_photo(mats: Path) -> None:
+    amend(mats, lambda record: record["photo"].update(sha256="0" * 64))
 
 
-def a_map_is_gone(photos: Path, mats: Path) -> None:
+def another_network(mats: Path) -> None:
+    amend(mats, lambda record: record["checkpoint"].update(sha256="0" * 64))
+
+
+def interrupted(mats: Path) -> None:
+    amend(mats, lambda record: record.update(interrupted=True))
+
+
+def a_map_is_gone(mats: Path) -> None:
     (mats / "b" / "b_normal.png").unlink()
 
 
-def a_map_is_empty(photos: Path, mats: Path) -> None:
+def a_map_is_empty(mats: Path) -> None:
     (mats / "b" / "b_normal.png").write_bytes(b"")
 
 
-def no_record(photos: Path, mats: Path) -> None:
+def no_record(mats: Path) -> None:
     (mats / "b" / "b.json").unlink()
 
 
-def another_record(photos: Path, mats: Path) -> None:
+def another_record(mats: Path) -> None:
     (mats / "b" / "b.json").write_text("[]")
 
 
 @pytest.mark.parametrize(
-    "change", [another_photo, another_network, a_map_is_gone, a_map_is_empty, no_record, another_record]
+    "change",
+    [another_photo, another_network, interrupted, a_map_is_gone, a_map_is_empty, no_record, another_record],
 )
 def test_what_is_not_finished_is_done(
-    change: Callable[[Path, Path], None], photos: Path, copy: Path, arguments: list[str], tried: list[str]
+    change: Callable[[Path], None], copy: Path, arguments: list[str], tried: list[str]
 ) -> None:
-    change(photos, copy)
+    change(copy)
     assert refine.cli.run([*arguments, "--out", str(copy), "--quiet"]) == 0
     assert tried == ["b", "broken"]
 
