@@ -29,7 +29,9 @@ PUBLIC = {
     "nets.baselines.autoencoder": "Autoencoder AutoencoderConfig NARROW_AUTOENCODER PAPER_AUTOENCODER",
     "nets.baselines.des18": "Des18 Des18Config NARROW_DES18 PAPER_DES18",
     "nets.baselines.des19": "Des19 Des19Config NARROW_DES19 PAPER_DES19",
-    "nets.checkpoint": "CheckpointError Record load_autoencoder load_model load_network read_record save_model",
+    "nets.checkpoint": (
+        "CheckpointError Record load_autoencoder load_model load_network read_record save_model"
+    ),
     "nets.generator": "Generator GeneratorConfig PAPER_GENERATOR NARROW_GENERATOR",
     "nets.discriminator": "Discriminator",
     "nets.render": "Camera Conventions PRESETS PointLight render",
