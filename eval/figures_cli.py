@@ -15,7 +15,7 @@ from eval.figures.answers import Answers
 from eval.figures.catalogue import COMPARED, FIGURES, QUICK, Counts, Studio, as_json, obstacle, page
 from eval.figures.sheet import write
 from eval.held_out import NAME as BUILT_IN
-from eval.methods import choose, find_weights, parse_inits
+from eval.methods import choose, find_weights, note_of_quick, parse_inits
 from eval.options import MatchExposure, ProtocolSeed, SceneLightsFile, Size
 from eval.real_scenes import read_scene_lights
 from eval.report import origin, provenance
@@ -35,7 +35,9 @@ def figures(
         str | None, typer.Option(help=f"Some of {', '.join(map(str, FIGURES))}, comma-separated.")
     ] = None,
     rows: Annotated[str | None, typer.Option(help="Rows of Fig. 4, 5 and 8, comma-separated.")] = None,
-    quick: Annotated[bool, typer.Option("--quick", help="Fewer scenes in Fig. 12 and 13.")] = False,
+    quick: Annotated[
+        bool, typer.Option("--quick", help="Fewer scenes in Fig. 12 and 13; fewer steps.")
+    ] = False,
     format: Annotated[str, typer.Option(help="png, jpg, pdf, svg.")] = "png",
     init: Annotated[
         list[str] | None,
@@ -57,7 +59,7 @@ def figures(
     with mistakes():
         chosen = _numbers(only)
         compared = [method.name for method in choose((rows or ",".join(COMPARED)).split(","))]
-        found, gaps = find_weights(choose(None), parse_inits(init or []))
+        found, gaps = find_weights(choose(None), parse_inits(init or []), quick=quick)
         synthetic = Synthetic(Synthetic.named(test_set), Settings(size=size, seed=seed), flips=flips)
         synthetic.scenes()
         real = None
@@ -77,6 +79,7 @@ def figures(
     caption = (
         f"The paper's figures on {synthetic.name}{'' if real is None else f' and {real.name}'}. "
         f"{synthetic.caption()} {'' if real is None else real.caption() + ' '}"
+        f"{note_of_quick(found)}"
         f"Our networks are narrow ones that were trained for hours on two CPU cores; {origin(about)}."
     )
     made = []

@@ -228,5 +228,11 @@ def quickened(recipe: Recipe) -> Recipe:
     return replace(recipe, stages=tuple(shortened(stage) for stage in recipe.stages))
 
 
+def note_of_quick(rows: Sequence[Row]) -> str:
+    """Return a sentence of a caption on rows that take fewer steps than they should, or nothing."""
+    names = ", ".join(row.method.name for row in rows if row.shortened)
+    return f"Quick: {names} with {QUICK_LATENT} steps in latent space only. " if names else ""
+
+
 def _digest(path: Path) -> str:
     return hashlib.sha256(path.read_bytes()).hexdigest()[:16]

@@ -15,7 +15,7 @@ from eval.datasets import NOVEL_LIGHTS, SIZE, spread
 from eval.datasets import Protocol as Settings
 from eval.held_out import NAME as BUILT_IN
 from eval.ledger import Ledger
-from eval.methods import METHODS, QUICK_LATENT, Method, Row, choose, find_weights, parse_inits
+from eval.methods import METHODS, Method, Row, choose, find_weights, note_of_quick, parse_inits
 from eval.options import (
     MatchExposure,
     NovelLights,
@@ -167,18 +167,12 @@ def _table(
     caption = (
         f"Table {table} on {yardstick.name}, {count} scenes. {yardstick.caption()} {NARROW}. Weights: "
         f"{', '.join(f'{row.method.name} {row.weights.name} {row.digest[:8]}' for row in rows) or 'none'}. "
-        f"{_shortened(rows)}"
+        f"{note_of_quick(rows)}"
         f"The paper's figures, of other scenes, are in parentheses; the best of ours is bold; "
         f"{' and '.join(made_by) or origin(about)}."
     )
     columns = TABLE1 if table == 1 else TABLE2
     return build(caption, columns, paper_figures(methods, table), run.results, gaps, run.skipped)
-
-
-def _shortened(rows: Sequence[Row]) -> str:
-    """Return a sentence on rows that take fewer steps than they should, or nothing."""
-    names = ", ".join(row.method.name for row in rows if row.shortened)
-    return f"Quick: {names} with {QUICK_LATENT} steps in latent space only. " if names else ""
 
 
 def _write(table: Table, stem: Path) -> None:

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from eval.datasets import CAMERA
-from eval.methods import METHODS, QUICK_LATENT, choose, find_weights, parse_inits
+from eval.methods import METHODS, QUICK_LATENT, choose, find_weights, note_of_quick, parse_inits
 from nets import checkpoint
 from nets.baselines.des19 import Des19, Des19Config
 from nets.checkpoint import Record, save_model
@@ -108,6 +108,8 @@ def test_gao19_is_a_search_from_des19_in_the_space_of_its_own_weights(
 
     quick, _ = find_weights(methods, quick=True)
     assert [row.shortened for row in quick] == [False, True, True]
+    assert note_of_quick(quick) == f"Quick: Gao19, Gao19+ with {QUICK_LATENT} steps in latent space only. "
+    assert note_of_quick(rows) == ""
     assert quick[1].settings() != rows[1].settings()
     assert [[stage.iterations for stage in row.recipe.stages] for row in quick if row.recipe] == [
         [QUICK_LATENT], [QUICK_LATENT, 200],
