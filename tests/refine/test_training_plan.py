@@ -192,11 +192,11 @@ MISTAKES: list[tuple[str, Any, str]] = [
     ("stages/0/soup", 1, "a stage has unknown soup; known are name, objective, phases, network"),
     ("stages/0/network", "des18", "stage syn: network must be a mapping of names to values, got 'des18'"),
     ("stages/0/network", {"width": 2}, "stage syn: network lacks kind"),
-    ("stages/0/network", {"kind": "soup"}, "no network is called 'soup'; the known ones are generator, des18"),
+    ("stages/0/network", {"kind": "soup"}, "no network is called 'soup'; the known ones are generator"),
     ("stages/0/network", {"kind": "des18", "soup": 1}, "Des18Config has no 'soup'; it has width, levels"),
     ("stages/0/network", {"kind": "autoencoder", "width": 0}, "not an auto-encoder"),
-    ("stages/0/network", {"kind": "des18"}, "stage syn trains a network of kind des18 on an objective for gen"),
-    ("stages/0/objective", {"kind": "des19"}, "a network of kind generator on an objective for des18 or des19"),
+    ("stages/0/network", {"kind": "des18"}, "trains a network of kind des18 on an objective for generator"),
+    ("stages/0/objective", {"kind": "des19"}, "a network of kind generator on an objective for des18"),
     ("stages/0/objective", {"kind": "gao19", "preset": "soup"}, "no preset is called 'soup'"),
 ]
 
