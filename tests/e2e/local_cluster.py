@@ -13,6 +13,7 @@ import sys
 import threading
 import time
 
+import dask
 from distributed import LocalCluster
 
 import refine.cli
@@ -33,6 +34,8 @@ def kill_one(cluster: LocalCluster, finished: threading.Event, held: list[int]) 
 def main() -> None:
     held: list[int] = []
     finished = threading.Event()
+    patience = dict.fromkeys(("connect", "tcp"), "600s")  # on a busy machine, workers begin late
+    dask.config.set({"distributed.comm.timeouts": patience})
     with LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=None) as cluster:
         killer = threading.Thread(target=kill_one, args=(cluster, finished, held))
         killer.start()

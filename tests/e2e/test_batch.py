@@ -245,6 +245,7 @@ def test_a_cluster_does_the_same_and_survives_a_worker(
         text=True,
         timeout=PATIENCE,
     )
+    assert done.returncode == 0, done.stderr
     told: dict[str, Any] = json.loads(done.stdout.splitlines()[-1])
     assert told["code"] == 3, done.stderr
     assert len(told["held"]) == 1
