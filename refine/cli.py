@@ -30,6 +30,7 @@ from refine.batch.plan import find_photos
 from refine.console import progress_bar, summarise
 from refine.errors import StoppedError, UserError
 from refine.export.targets import parse_targets
+from refine.limits import GIB, WORTH_SAYING
 from refine.request import ESTIMATED, Request, enough_memory
 
 USER_ERROR, INTERRUPTED = 2, 130
@@ -115,6 +116,9 @@ def fit(
     quiet: Annotated[bool, _switch("--quiet", "-q", help="Print nothing but errors")] = False,
     device: Annotated[str, _option("NAME", "(cpu), cuda, cuda:1, mps", None)] = "cpu",
     threads: Annotated[int | None, _option("N", "CPU threads (one per core; 1 in batches)", None)] = None,
+    max_memory: Annotated[
+        float | None, _option("GIB", "Refuse what takes more memory (what is free)", None)
+    ] = None,
     workers: Annotated[int | None, _option("N", "Of a batch: processes (one per core)", None)] = None,
     scheduler: Annotated[str | None, _option("ADDRESS", "Of a batch with --engine dask", None)] = None,
     version: Annotated[
@@ -147,6 +151,8 @@ def fit(
     for name, number, lowest in (*numbers, ("workers", workers, 1)):
         if number is not None and not lowest <= number < 2**31:
             raise UserError(f"--{name} {number} is out of range; give {lowest} or more.")
+    if max_memory is not None and not max_memory > 0.0:
+        raise UserError(f"--max-memory {max_memory} is out of range; give GiB above 0.")
     if not 0 <= seed < 2**63:
         raise UserError(f"--seed {seed} is out of range; give a number from 0 to 2^63 - 1.")
     if quick:
@@ -196,6 +202,7 @@ def fit(
         uncertainty=uncertainty,
         thumbnail=batch,
         export=tuple(targets),
+        max_memory=max_memory,
     )
     if batch:
         from refine.batch.run import refine_batch
@@ -212,6 +219,9 @@ def fit(
     checkpoint = describe_checkpoint(init)
     refiner = request.refiner()
     flash = request.flash(photos)
+    needed = request.require_memory(refiner, reads)
+    if not quiet and needed >= WORTH_SAYING:
+        print(f"refine: this takes about {needed / GIB:.1f} GiB of memory.", file=sys.stderr)
     with progress_bar(shown=not quiet and sys.stderr.isatty()) as progress, enough_memory(), _log(quiet):
         try:
             refined = request.fit(refiner, reads, flash, progress)

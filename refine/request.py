@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any, Literal, cast
 
 from refine.arguments import parse_camera, parse_point
 from refine.errors import UserError
+from refine.limits import GIB, require_memory
 
 if TYPE_CHECKING:
     from nets.render import PointLight
@@ -26,7 +27,7 @@ if TYPE_CHECKING:
 ESTIMATED = "estimated"
 """A light that is not given."""
 
-NOT_SETTINGS = ("report", "uncertainty", "thumbnail", "export")
+NOT_SETTINGS = ("report", "uncertainty", "thumbnail", "export", "max_memory")
 """What decides which files are written, not what is in them: the record lists the files themselves."""
 
 
@@ -56,6 +57,7 @@ class Request:
         uncertainty: whether deviations are written.
         thumbnail: whether a small picture for an index is written.
         export: targets of `refine.export`.
+        max_memory: GiB that a photo may take; None allows what is free.
     """
 
     init: str
@@ -79,6 +81,7 @@ class Request:
     uncertainty: bool = False
     thumbnail: bool = False
     export: tuple[str, ...] = ()
+    max_memory: float | None = None
 
     def settings(self) -> dict[str, Any]:
         """Return what a result's record says was asked for, as JSON holds it."""
@@ -147,9 +150,24 @@ class Request:
         Raises:
             refine.errors.UserError: it cannot be used.
         """
+        from nets.decoding import Limits
         from refine.photo import read_photo
 
-        return read_photo(photo, color_space=cast("ColorSpaceChoice", self.color_space))
+        limits = Limits()
+        if self.max_memory is not None:
+            limits = Limits(memory=min(limits.memory, int(self.max_memory * GIB)))
+        return read_photo(photo, color_space=cast("ColorSpaceChoice", self.color_space), limits=limits)
+
+    def require_memory(self, refiner: Refiner, photos: Sequence[Photo]) -> int:
+        """Estimate the memory that refinement takes, in bytes.
+
+        Raises:
+            refine.errors.UserError: it is more than is allowed, or free.
+        """
+        longest = max(photos[0].size)
+        scale = min(1.0, self.resolution / longest) if self.resolution else 1.0
+        size = round(photos[0].size[0] * scale), round(photos[0].size[1] * scale)
+        return require_memory(size, refiner.engine, len(photos), allowed=self.max_memory)
 
     def fit(
         self,
@@ -163,6 +181,7 @@ class Request:
         Raises:
             refine.errors.UserError: as `Refiner.fit` and `Refiner.fit_many`.
         """
+        self.require_memory(refiner, photos)
         falloff = None if flash is not None else cast("FalloffChoice", self.falloff)
         if self.one_surface:
             return refiner.fit_many(
