@@ -73,13 +73,21 @@ class Row:
         model = FlipAverage(network) if flips else network
         return Refiner(model, self.recipe or "paper", camera=camera, resolution=size, seed=seed)
 
+    def sources(self) -> str:
+        """Return names and digests of the files its answers come from, for a caption."""
+        files = (self.weights, *self._auto_encoders())
+        return f"{self.method.name} {' + '.join(f'{file.name} {_digest(file)[:8]}' for file in files)}"
+
+    def _auto_encoders(self) -> list[Path]:
+        stages = self.recipe.stages if self.recipe else ()
+        return [resolve(stage.checkpoint) for stage in stages if isinstance(stage, LatentStage)]
+
     def settings(self) -> dict[str, Any]:
         """Return what the row's answers depend on: digests of weights and recipe."""
         if self.recipe is None:
             return {"row": self.method.name, "checkpoint": self.digest, "recipe": None}
         known = json.dumps(asdict(self.recipe), sort_keys=True)
-        latent = [stage for stage in self.recipe.stages if isinstance(stage, LatentStage)]
-        digests = [_digest(resolve(stage.checkpoint)) for stage in latent]
+        digests = [_digest(file) for file in self._auto_encoders()]
         recipe = hashlib.sha256("".join([known, *digests]).encode()).hexdigest()[:16]
         return {
             "row": self.method.name,

@@ -166,7 +166,7 @@ def _table(
     made_by = [origin({"commit": commit, "machine": machine}) for commit, machine in sorted(origins)]
     caption = (
         f"Table {table} on {yardstick.name}, {count} scenes. {yardstick.caption()} {NARROW}. Weights: "
-        f"{', '.join(f'{row.method.name} {row.weights.name} {row.digest[:8]}' for row in rows) or 'none'}. "
+        f"{', '.join(row.sources() for row in rows) or 'none'}. "
         f"{note_of_quick(rows)}"
         f"The paper's figures, of other scenes, are in parentheses; the best of ours is bold; "
         f"{' and '.join(made_by) or origin(about)}."

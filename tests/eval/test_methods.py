@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import re
 from pathlib import Path
 
@@ -110,6 +111,13 @@ def test_gao19_is_a_search_from_des19_in_the_space_of_its_own_weights(
     assert [row.shortened for row in quick] == [False, True, True]
     assert note_of_quick(quick) == f"Quick: Gao19, Gao19+ with {QUICK_LATENT} steps in latent space only. "
     assert note_of_quick(rows) == ""
+    des19_file, gao19_file = (
+        f"{file.name} {hashlib.sha256(file.read_bytes()).hexdigest()[:8]}"
+        for file in (tmp_path / "des19.safetensors", tmp_path / "gao19.safetensors")
+    )
+    assert [row.sources() for row in rows[:2]] == [
+        f"Des19 {des19_file}", f"Gao19 {des19_file} + {gao19_file}",
+    ]  # fmt: skip
     assert quick[1].settings() != rows[1].settings()
     assert [[stage.iterations for stage in row.recipe.stages] for row in quick if row.recipe] == [
         [QUICK_LATENT], [QUICK_LATENT, 200],
