@@ -27,6 +27,12 @@ LENGTHS = struct.Struct("<QQ")
 LIGHT_BYTES, RESIZING_BYTES = 13, 18
 """Bytes per pixel of what a photo becomes: linear light and a mask; and those and what resizing them adds."""
 
+SPARSEST = 2000
+"""Pixels per byte of a file, at most: deflate, at its best, makes a byte of a thousand grey pixels."""
+
+ALWAYS_ENOUGH = 2**22
+"""Pixels that any file may have: they do no harm."""
+
 NATIVE = {"uint8": "uint8", "uint16": "uint16", "half": "float16"}
 """Pixel types that are handed on as they are; all others become float32."""
 
@@ -86,7 +92,7 @@ def decode(path: str, limits: Limits) -> tuple[dict[str, Any], np.ndarray]:
         raise Refused("size" if " limit" in reason else "format", reason)
     try:
         spec = opened.spec()
-        _require_reasonable_size(spec, limits)
+        _require_reasonable_size(spec, os.path.getsize(path), limits)
         stored = str(spec.format) if str(spec.format) in NATIVE else "float"
         pixels = opened.read_image(0, 0, 0, spec.nchannels, stored)
         if pixels is None or opened.has_error:
@@ -106,7 +112,7 @@ def decode(path: str, limits: Limits) -> tuple[dict[str, Any], np.ndarray]:
     return header, pixels.reshape(spec.height, spec.width, spec.nchannels)
 
 
-def _require_reasonable_size(spec: Any, limits: Limits) -> None:
+def _require_reasonable_size(spec: Any, size: int, limits: Limits) -> None:
     """Refuse, from the header alone, what would not fit in memory or is not a flat picture."""
     width, height = spec.width, spec.height
     pixels = width * height
@@ -114,6 +120,8 @@ def _require_reasonable_size(spec: Any, limits: Limits) -> None:
     needed = max(stored + LIGHT_BYTES * pixels, RESIZING_BYTES * pixels)
     if max(width, height) > limits.side or needed > limits.memory:
         raise Refused("size", f"{width} x {height}")
+    if pixels > max(ALWAYS_ENOUGH, SPARSEST * size):
+        raise Refused("damage", f"{size} bytes cannot hold {width} x {height} pixels")
     if spec.deep or spec.depth > 1:
         raise Refused("flat", "")
     if pixels < 1 or spec.nchannels < 1:
