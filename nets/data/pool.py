@@ -66,7 +66,7 @@ class MaterialPool:
         folder = Path(path)
         try:
             entries = [Entry(**fields) for fields in json.loads((folder / INDEX).read_text())["entries"]]
-            self._array = np.load(folder / ARRAY, mmap_mode="r")
+            self._array = np.lib.format.open_memmap(folder / ARRAY, mode="r")
         except (OSError, ValueError, KeyError, TypeError) as error:
             raise DataError(f"{folder} is not a complete material pool: {error}") from error
         if self._array.shape[:2] != (len(entries), 10):
