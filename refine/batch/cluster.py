@@ -7,10 +7,10 @@ from __future__ import annotations
 
 import functools
 import threading
-from collections.abc import Generator, Sequence
+from collections.abc import Callable, Generator, Sequence
+from typing import Any
 
-from refine.batch.plan import Job
-from refine.batch.work import Bench, Opening
+from refine.batch.processes import J, Work
 from refine.errors import UserError
 
 PATIENCE = 30.0
@@ -20,14 +20,14 @@ _ONE_AT_A_TIME = threading.Lock()
 
 
 def work_on_cluster(
-    opening: Opening, jobs: Sequence[Job], address: str
-) -> Generator[tuple[Job, str | None], None, None]:
+    opening: Callable[[], Work[J]], jobs: Sequence[J], address: str
+) -> Generator[tuple[J, str | None], None, None]:
     """Yield every job with its outcome (None, or why it failed) as soon as it is there.
 
     Jobs that have not begun are withdrawn when the iterator is closed or raises.
 
     Args:
-        opening: what every worker process needs to know.
+        opening: called once in every worker process; returns what does a job. It must be hashable.
         jobs: what there is to do.
         address: of the scheduler, as `tcp://10.0.0.1:8786`.
 
@@ -50,20 +50,20 @@ def work_on_cluster(
     with client:
         futures = {client.submit(attempt, opening, job, pure=False): job for job in jobs}
         try:
-            for future in as_completed(futures):
+            for future in as_completed(futures, loop=client.loop):
                 yield futures[future], _outcome(future)
         finally:
             client.cancel(list(futures))
 
 
-def attempt(opening: Opening, job: Job) -> str | None:
+def attempt(opening: Callable[[], Work[J]], job: J) -> str | None:
     """Do a job in a worker process, where the network stays loaded; one at a time, for torch has one seed."""
     with _ONE_AT_A_TIME:
-        return _bench(opening)(job)
+        return _work(opening)(job)
 
 
 @functools.lru_cache(maxsize=1)
-def _bench(opening: Opening) -> Bench:
+def _work(opening: Callable[[], Work[Any]]) -> Work[Any]:
     return opening()
 
 
