@@ -8,6 +8,7 @@ from __future__ import annotations
 import hashlib
 import os
 import pickle
+import warnings
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -108,7 +109,10 @@ def _read_torchvision(path: Path) -> dict[str, Tensor]:
         found = hashlib.file_digest(file, "sha256").hexdigest()
     if not found.startswith(start):
         raise ValueError(f"its sha256 is {found}, expected {start}...")
-    return from_torchvision(torch.load(path, map_location="cpu", weights_only=True))
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # about pickles that are refused anyway
+        state = torch.load(path, map_location="cpu", weights_only=True)
+    return from_torchvision(state)
 
 
 def from_torchvision(state: Mapping[str, Tensor]) -> dict[str, Tensor]:

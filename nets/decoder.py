@@ -36,6 +36,9 @@ ALWAYS_ENOUGH = 2**22
 NATIVE = {"uint8": "uint8", "uint16": "uint16", "half": "float16"}
 """Pixel types that are handed on as they are; all others become float32."""
 
+NAMES_OF_NOTHING = (".null", ".nul", ".term")
+"""Ends of names that OpenImageIO takes for pictures without looking into the file."""
+
 ATTRIBUTES = (
     "oiio:ColorSpace",
     "oiio:UnassociatedAlpha",
@@ -84,9 +87,13 @@ def decode(path: str, limits: Limits) -> tuple[dict[str, Any], np.ndarray]:
     wanted.attribute("oiio:UnassociatedAlpha", 1)
     oiio.attribute("limits:imagesize_MB", max(1, limits.memory // 2**20))
     try:
-        opened = oiio.ImageInput.open(path, wanted)
+        path.encode()
     except UnicodeEncodeError:
         raise Refused("name", "") from None
+    with open(path, "rb") as file:
+        # The content decides the format; to some readers the name would say it all.
+        nameless = path.lower().endswith(NAMES_OF_NOTHING)
+        opened = oiio.ImageInput.open(f"/dev/fd/{file.fileno()}" if nameless else path, wanted)
     if opened is None:
         reason = _one_line(oiio.geterror())
         raise Refused("size" if " limit" in reason else "format", reason)
@@ -176,6 +183,8 @@ def serve(requests: BinaryIO, out: BinaryIO) -> None:
             _reply(out, dict(zip(("refused", "reason"), refused.args, strict=True)))
         except MemoryError:
             _reply(out, {"refused": "memory", "reason": ""})
+        except OSError as error:  # the file went away meanwhile
+            _reply(out, {"refused": "damage", "reason": str(error.strerror)})
         else:
             _reply(out, {**header, "dtype": str(pixels.dtype)}, pixels)
             del pixels
