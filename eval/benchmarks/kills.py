@@ -2,7 +2,8 @@
 
 A process writes the files of two results in turn, again and again, into one folder, until it is killed after
 some milliseconds. Every file must be that of one of the two, to the byte; what the writer had not renamed yet
-may lie beside them under a hidden name, never in their place.
+may lie beside them under a hidden name, never in their place. The record, the last of them, is away while the
+others are renamed: where it is, all are of one result.
 """
 
 from __future__ import annotations
@@ -46,7 +47,7 @@ class Kills:
         kills: how many writers were killed.
         whole: files that were there and were one of the two, whole.
         broken: files that were not.
-        mixed: kills after which the files were not all of one result: between two renamings.
+        unrecorded: kills after which the record was away: between two renamings.
         leftovers: hidden files that killed writers left.
     """
 
@@ -54,7 +55,7 @@ class Kills:
     kills: int = 0
     whole: int = 0
     broken: list[str] = field(default_factory=list)
-    mixed: int = 0
+    unrecorded: int = 0
     leftovers: int = 0
 
 
@@ -101,7 +102,10 @@ def examine(folder: Path, found: Kills) -> None:
             versions.add(version)
         else:
             found.broken.append(f"{path.name} after kill {found.kills}")
-    found.mixed += len(versions) > 1
+    if not (folder / NAMES[-1]).exists():
+        found.unrecorded += 1
+    elif len(versions) > 1:
+        found.broken.append(f"a record of two results after kill {found.kills}")
 
 
 def kill_one(folder: Path, found: Kills) -> None:

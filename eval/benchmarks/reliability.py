@@ -55,10 +55,18 @@ def _text(value: Any) -> str:
 def fill(text: str, known: Mapping[str, str]) -> str:
     """Return text with every `{run.name}` replaced by its figure.
 
+    Paragraphs that begin with `{?run}` are of a run that is there, those with `{!run}` of one that is not.
+
     Raises:
         KeyError: there is no such figure.
     """
-    return re.sub(r"\{([a-z_]+\.[\w. -]+)\}", lambda match: known[match[1]], text)
+    runs = {name.partition(".")[0] for name in known}
+    kept = []
+    for paragraph in text.split("\n\n"):
+        condition = re.match(r"\{([?!])(\w+)\}", paragraph)
+        if condition is None or (condition[1] == "?") == (condition[2] in runs):
+            kept.append(paragraph[condition.end() :].lstrip() if condition else paragraph)
+    return re.sub(r"\{([a-z_]+\.[\w. -]+)\}", lambda match: known[match[1]], "\n\n".join(kept))
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

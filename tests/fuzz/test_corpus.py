@@ -73,7 +73,7 @@ def test_a_bomb_is_refused_without_memory_or_time(tmp_path: Path) -> None:
     start = time.process_time()
     for side, words in ((60_000, "too large"), (20_000, "too large"), (10_000, "cannot hold")):
         size = 1_000_000 if side > 10_000 else 40_000
-        assert words in outcome(tmp_path, bomb(side, side, size)), side
+        assert words in outcome(tmp_path, bomb(side, side, size), "a.png"), side
     assert time.process_time() - start < 2.0
     assert decoder_peak() - before < 64 * 2**10
 
