@@ -35,7 +35,7 @@ def write_photos(folder: Path, count: int, seed: int, examples: Path = EXAMPLES)
     sources = sorted(examples.glob("*.jpg"))
     random = np.random.default_rng(seed)
     for place in range(count):
-        pixels = oiio.ImageBuf(str(sources[place % len(sources)])).get_pixels(oiio.UINT8)
+        pixels = np.asarray(oiio.ImageBuf(str(sources[place % len(sources)])).get_pixels(oiio.UINT8))
         shorter = min(pixels.shape[:2])
         side = int(random.integers(int(SMALLEST_CROP * shorter), shorter + 1))
         top, left = (int(random.integers(0, length - side + 1)) for length in pixels.shape[:2])
