@@ -162,7 +162,7 @@ def _import_av() -> ModuleType:
     return av
 
 
-def _even(pixels: Frame) -> Frame:
+def _even(pixels: Frame) -> UInt8[np.ndarray, "even_h even_w 3"]:
     """Leave out the last row or column where there is an odd number: colour is halved in both directions."""
     height, width = (side - side % 2 for side in pixels.shape[:2])
     return np.ascontiguousarray(pixels[:height, :width])
