@@ -13,7 +13,7 @@ from eval.datasets import SIZE
 from eval.datasets import Protocol as Settings
 from eval.figures.answers import Answers
 from eval.figures.catalogue import COMPARED, FIGURES, QUICK, Counts, Studio, as_json, obstacle, page
-from eval.figures.sheet import write
+from eval.figures.sheet import require_format, write
 from eval.held_out import NAME as BUILT_IN
 from eval.methods import choose, find_weights, note_of_quick, parse_inits
 from eval.options import MatchExposure, ProtocolSeed, SceneLightsFile, Size
@@ -58,6 +58,7 @@ def figures(
         torch.set_num_threads(threads)
     with mistakes():
         chosen = _numbers(only)
+        require_format(format)
         compared = [method.name for method in choose((rows or ",".join(COMPARED)).split(","))]
         found, gaps = find_weights(choose(None), parse_inits(init or []), quick=quick)
         synthetic = Synthetic(Synthetic.named(test_set), Settings(size=size, seed=seed), flips=flips)

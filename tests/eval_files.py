@@ -56,6 +56,14 @@ def material(seed: int, size: int = 80) -> SVBRDF:
     return SVBRDF(normal, diffuse, 0.2 + 0.7 * roughness, 0.2 * specular)
 
 
+def write_strips(folder: Path, count: int) -> Path:
+    """Write a folder of strips, `scene_0.png` and so on."""
+    folder.mkdir()
+    for seed in range(count):
+        write_strip(folder / f"scene_{seed}.png", material(seed))
+    return folder
+
+
 def write_pbr(folder: Path, pixels: int = 72) -> None:
     folder.mkdir(parents=True)
     values = {"basecolor": (188, 188, 188), "normal": (128, 128, 255), "roughness": (128, 128, 128)}

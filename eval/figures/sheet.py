@@ -112,16 +112,25 @@ def draw(sheet: Sheet) -> Figure:
     return figure
 
 
+def require_format(kind: str) -> None:
+    """Check that figures can be written as that.
+
+    Raises:
+        ValueError: they cannot, naming what they can be written as.
+    """
+    known = FigureCanvasAgg.get_supported_filetypes()
+    if kind not in known:
+        raise ValueError(f"figures cannot be written as {kind!r}; choose one of {', '.join(sorted(known))}")
+
+
 def write(figure: Figure, path: Path) -> None:
     """Write a figure, whole or not at all; the suffix says as what (png, jpg, pdf, ...).
 
     Raises:
-        ValueError: a suffix that matplotlib does not know.
+        ValueError: as `require_format`.
     """
     kind = path.suffix.lstrip(".").lower()
-    known = FigureCanvasAgg.get_supported_filetypes()
-    if kind not in known:
-        raise ValueError(f"{path} cannot be written: figures are {', '.join(sorted(known))}")
+    require_format(kind)
     undated = {"pdf": {"CreationDate": None}, "svg": {"Date": None}, "png": {"Software": None}}
     with matplotlib.style.context("default"), write_atomically(path) as temporary:
         figure.savefig(temporary, format=kind, dpi=DPI, metadata=undated.get(kind))

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.eval_files import FakeModel, write_development
+from tests.eval_files import FakeModel, write_checkpoint, write_development
 
 
 @pytest.fixture
@@ -19,3 +19,9 @@ def data(tmp_path: Path) -> Path:
 def no_network(monkeypatch: pytest.MonkeyPatch) -> None:
     """Load a grey guess in place of any checkpoint."""
     monkeypatch.setattr("refine.refiner.load_model", lambda name: FakeModel())
+
+
+@pytest.fixture
+def tiny(tmp_path: Path) -> Path:
+    """Return the checkpoint of a tiny network that was never trained."""
+    return write_checkpoint(tmp_path / "tiny.safetensors")

@@ -23,7 +23,7 @@ from eval.yardsticks import Real, Synthetic
 from nets.data.strips import write_strip
 from refine.refiner import Refiner
 from tests.eval.test_metrics import numpy_scores
-from tests.eval_files import material, write_checkpoint, write_pbr, write_surface
+from tests.eval_files import material, write_pbr, write_strips, write_surface
 
 SIZE = 64
 ROWS = ("Ours_syn", "Ours_syn+")
@@ -39,17 +39,8 @@ def surroundings(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[No
 
 
 @pytest.fixture
-def tiny(tmp_path: Path) -> Path:
-    return write_checkpoint(tmp_path / "tiny.safetensors")
-
-
-@pytest.fixture
 def strips(tmp_path: Path) -> Path:
-    folder = tmp_path / "tiles"
-    folder.mkdir()
-    for seed in range(2):
-        write_strip(folder / f"scene_{seed}.png", material(seed))
-    return folder
+    return write_strips(tmp_path / "tiles", 2)
 
 
 @pytest.fixture
