@@ -84,9 +84,7 @@ def fit(
     light: Annotated[str, _surface("X,Y,Z", "Position of the flash (estimated)")] = ESTIMATED,
     falloff: Annotated[str | None, _surface("NAME", "(none), inverse_square, auto")] = None,
     camera: Annotated[str | None, _surface("NAME", "(perspective), orthographic, collocated, X,Y,Z")] = None,
-    color_space: Annotated[
-        str, _surface("NAME", "(auto), srgb, linear, gamma22, display-p3, adobe-rgb")
-    ] = "auto",
+    color_space: Annotated[str, _surface("NAME", "(auto) srgb linear gamma22 display-p3 adobe-rgb")] = "auto",
     resolution: Annotated[int, _surface("PIXELS", "Longer side (256); 0 keeps the photo's")] = 256,
     one_surface: Annotated[
         bool, _switch("--one-surface", help="The photos show one, in register", panel="The photo")
@@ -96,7 +94,7 @@ def fit(
     ] = False,
     lights: Annotated[Path | None, _surface("PATH", "Positions of their flashes (estimated)")] = None,
     init: Annotated[str, _refinement("NAME|FILE", "Network to start from (default)")] = "default",
-    recipe: Annotated[str, _refinement("NAME", "Stages of refinement (default), fast, paper")] = "default",
+    recipe: Annotated[str, _refinement("NAME", "Stages (default), fast, paper, gao, gao+")] = "default",
     iters: Annotated[int | None, _refinement("N", "Steps of all stages (the recipe's); 0 for none")] = None,
     quick: Annotated[
         bool,
