@@ -66,9 +66,9 @@ def refine_batch(
     }
     known, waiting = len(outcomes), [job for job in jobs if job not in outcomes]
     settings = {**request.settings(), "checkpoint": checkpoint["sha256"]}
-    _write(out, jobs, outcomes, settings)
     stopped = False
     try:
+        _write(out, jobs, outcomes, settings)
         with (
             batch_view(len(jobs), known, quiet=quiet) as tell,
             closing(_work(request, waiting, workers, scheduler)) as work,
