@@ -1,11 +1,11 @@
 """How much memory a refinement takes, estimated before it starts, and whether there is so much.
 
-The estimate is a line through measured peaks of whole runs, the report included, by engine.
+The estimate is a line through measured peaks of whole runs, the report included, by engine; flatter for large
+photos, of which `fused` has only some bands at work.
 """
 
 from __future__ import annotations
 
-import math
 from pathlib import Path
 
 from refine.errors import UserError
@@ -18,6 +18,12 @@ BASE = 640 * 2**20
 PER_PIXEL = {"fused": 500, "reference": 1700, "compiled": 1700}
 """Bytes per pixel of the maps, by engine. Measured: `fused` 758 MiB at 512 pixels a side, 1,750 at 1,536;
 `reference` 988 at 512, 2,239 at 1,024. Not measured: `compiled`, whose steps take less than those."""
+
+LARGE = 1536**2
+"""Pixels from which on `fused` takes `PER_PIXEL_OF_LARGE` for each more."""
+
+PER_PIXEL_OF_LARGE = 240
+"""Bytes. Measured: 1,674 MiB at 2,048 pixels a side and 4,558 at 4,096, of a photo."""
 
 PER_FURTHER_PHOTO = 60
 """The same of every further photo of one surface, for the fused engine; for the others in proportion."""
@@ -35,7 +41,9 @@ def memory_needed(size: tuple[int, int], engine: str, photos: int = 1) -> int:
         photos: of the surface.
     """
     share = 1.0 + (photos - 1) * PER_FURTHER_PHOTO / PER_PIXEL["fused"]
-    return BASE + int(PER_PIXEL[engine] * share * size[0] * size[1])
+    pixels = size[0] * size[1]
+    large = max(0, pixels - LARGE) if engine == "fused" else 0
+    return BASE + int(share * (PER_PIXEL[engine] * (pixels - large) + PER_PIXEL_OF_LARGE * large))
 
 
 def free_memory() -> int | None:
@@ -71,10 +79,19 @@ def require_memory(
         most, limit = int(allowed * GIB), f"--max-memory allows {allowed:g}"
         if needed <= most:
             return needed
-    least = memory_needed((1, 1), engine, photos)
-    room = max(0, most - least) / max(1, needed - least)
-    side = int(math.sqrt(room) * max(size))
+    side = _largest_side(size, engine, photos, most)
     raise UserError(
         f"Maps of {size[1]} x {size[0]} pixels take about {needed / GIB:.1f} GiB of memory but {limit}; "
         + (f"ask for --resolution {side} or less." if side >= 16 else "allow more, or free some.")
     )
+
+
+def _largest_side(size: tuple[int, int], engine: str, photos: int, most: int) -> int:
+    """Return the longest side of this shape that fits; 0 if none does."""
+    low, high = 0, max(size)
+    while low < high:
+        middle = (low + high + 1) // 2
+        shape = tuple(max(1, round(side * middle / max(size))) for side in size)
+        fits = memory_needed((shape[0], shape[1]), engine, photos) <= most
+        low, high = (middle, high) if fits else (low, middle - 1)
+    return low
