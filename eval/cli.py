@@ -25,6 +25,7 @@ from eval.development import (
 from eval.figures_cli import figures
 from eval.lights import evaluate_lights, light_estimator, lights_markdown
 from eval.options import (
+    Flips,
     MatchExposure,
     NovelLights,
     ProtocolSeed,
@@ -32,6 +33,7 @@ from eval.options import (
     SceneLightsFile,
     Scenes,
     Size,
+    Threads,
 )
 from eval.photos import find_photos, photos_markdown, score_photos
 from eval.real import evaluate_real, real_estimator, real_markdown
@@ -54,8 +56,6 @@ Checkpoints = Annotated[
 ]
 RecipeName = Annotated[str, typer.Option(help=f"none, or {', '.join(sorted(RECIPES))}.")]
 Iterations = Annotated[int | None, typer.Option(min=0, help="Iterations; the recipe's own by default.")]
-Flips = Annotated[bool, typer.Option(help="Average the network over four mirrored photos.")]
-Threads = Annotated[int, typer.Option(min=0, help="CPU threads; 0 leaves torch's choice.")]
 JsonFile = Annotated[Path | None, typer.Option("--json", help="Write everything here.")]
 MarkdownFile = Annotated[Path | None, typer.Option("--markdown", help="Write the table here.")]
 

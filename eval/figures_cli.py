@@ -16,7 +16,7 @@ from eval.figures.catalogue import COMPARED, FIGURES, QUICK, Counts, Studio, as_
 from eval.figures.sheet import require_format, write
 from eval.held_out import NAME as BUILT_IN
 from eval.methods import choose, find_weights, note_of_quick, parse_inits
-from eval.options import MatchExposure, ProtocolSeed, SceneLightsFile, Size
+from eval.options import Flips, Inits, MatchExposure, ProtocolSeed, SceneLightsFile, Size, Threads
 from eval.real_scenes import read_scene_lights
 from eval.report import origin, provenance
 from eval.yardsticks import Real, Synthetic
@@ -39,16 +39,13 @@ def figures(
         bool, typer.Option("--quick", help="Fewer scenes in Fig. 12 and 13; fewer steps.")
     ] = False,
     format: Annotated[str, typer.Option(help="png, jpg, pdf, svg.")] = "png",
-    init: Annotated[
-        list[str] | None,
-        typer.Option("--init", help="ROW=CHECKPOINT: a row's weights, a shipped name or a file."),
-    ] = None,
+    init: Inits = None,
     size: Size = SIZE,
     seed: ProtocolSeed = 0,
     lights: SceneLightsFile = None,
     match_exposure: MatchExposure = False,
-    flips: Annotated[bool, typer.Option(help="Average networks over four mirrored photos.")] = True,
-    threads: Annotated[int, typer.Option(min=0, help="CPU threads; 0 leaves torch's choice.")] = 0,
+    flips: Flips = True,
+    threads: Threads = 0,
 ) -> None:
     """The paper's figures 4 to 13: comparisons, ablations, lights, failures.
 

@@ -18,3 +18,9 @@ SceneLightsFile = Annotated[
 MatchExposure = Annotated[
     bool, typer.Option(help="Refine under a light as bright as the initialization needs it, not 1.")
 ]
+Flips = Annotated[bool, typer.Option(help="Average networks over four mirrored photos.")]
+Threads = Annotated[int, typer.Option(min=0, help="CPU threads; 0 leaves torch's choice.")]
+Inits = Annotated[
+    list[str] | None,
+    typer.Option("--init", help="ROW=CHECKPOINT: a row's weights, a shipped name or a file."),
+]

@@ -17,6 +17,8 @@ from eval.held_out import NAME as BUILT_IN
 from eval.ledger import Ledger
 from eval.methods import METHODS, Method, Row, choose, find_weights, note_of_quick, parse_inits
 from eval.options import (
+    Flips,
+    Inits,
     MatchExposure,
     NovelLights,
     ProtocolSeed,
@@ -47,11 +49,6 @@ Names = Annotated[
 Quick = Annotated[
     bool, typer.Option("--quick", help="8 scenes of Table 1, 3 of Table 2; Gao19 with fewer steps.")
 ]
-Inits = Annotated[
-    list[str] | None,
-    typer.Option("--init", help="ROW=CHECKPOINT: a row's weights, a shipped name or a file."),
-]
-Flips = Annotated[bool, typer.Option(help="Average networks over four mirrored photos.")]
 Workers = Annotated[int, typer.Option(min=1, help="Processes, of one CPU thread each.")]
 
 

@@ -15,7 +15,7 @@ from eval.real import exposure
 from eval.real_scenes import CAMERA as CAMERA_AT_FLASH
 from eval.real_scenes import RealScene
 from losses.perceptual import LPIPS
-from nets.render import render
+from nets.render import PointLight, render
 from nets.svbrdf import MAPS, SVBRDF
 
 LIGHTS = 3
@@ -46,9 +46,7 @@ def renderings(answers: Answers, indices: Sequence[int], names: Sequence[str], l
             photo = Picture(as_seen(scene.photo), scene.name) if number == 0 else Picture(None)
             pictures = [photo, Picture(as_seen(truth))]
             for name in names:
-                material = _svbrdf(answers, name, index)
-                rendered = None if material is None else render(material, light, CAMERA)
-                pictures.append(_compared(rendered, truth, lpips))
+                pictures.append(_compared(_lit(answers, name, index, light), truth, lpips))
             lines.append((f"light {number + 1}", pictures))
     return grid(("photo", "truth", *names), lines)
 
@@ -121,8 +119,12 @@ def _rendering(answers: Answers, name: str, index: int) -> torch.Tensor | None:
     scene = answers.scene(index)
     if isinstance(scene, RealScene):
         return _real(answers, name, index, _spread_lights(scene)[0])
+    return _lit(answers, name, index, scene.lights[:1])
+
+
+def _lit(answers: Answers, name: str, index: int, light: PointLight) -> torch.Tensor | None:
     material = _svbrdf(answers, name, index)
-    return None if material is None else render(material, scene.lights[:1], CAMERA)
+    return None if material is None else render(material, light, CAMERA)
 
 
 def _real(answers: Answers, name: str, index: int, number: int) -> torch.Tensor | None:
