@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import contextlib
 import os
-import secrets
 import stat
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
@@ -17,15 +16,11 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float32, Shaped
 
-try:
-    import fcntl
-except ImportError:  # Windows
-    fcntl = None  # type: ignore[assignment]
-
 from nets import decoding
 from nets.decoding import Decoded, DecodingError, Limits
 from nets.text import printable
 from refine.errors import UserError
+from refine.staging import flush, held, staging_folder
 
 
 @dataclass(frozen=True)
@@ -122,12 +117,12 @@ def write_together(
 ) -> Iterator[list[Path]]:
     """Write several files so that either all of them appear, complete, or none does.
 
-    Yields temporary siblings of `paths` with the same extensions, already created and empty. When the
-    block ends well they are flushed to disk and renamed to `paths`, replacing what was there; when
-    anything is raised they are removed, and so are the folders that were created for them. Of several, the
-    last is taken away before the others are replaced and comes back last: where it is, even after a kill,
-    everything beside it is of the same run. Two processes that write into one folder rename one after the
-    other.
+    Yields temporary files with the same extensions, already created and empty, in a hidden folder beside
+    `paths`. When the block ends well they are flushed to disk and renamed to `paths`, replacing what was
+    there; when anything is raised they are removed, and so are the folders that were created for them. Of
+    several, the last is taken away before the others are replaced and comes back last: where it is, even
+    after a kill, everything beside it is of the same run. Two processes that write into one folder rename
+    one after the other. What a killed process left in a folder is removed by the next that writes there.
 
     Args:
         paths: of the files.
@@ -143,30 +138,36 @@ def write_together(
     created: list[Path] = []
     current = targets[0] if targets else Path()
     try:
-        for current in targets:
-            created += _make_folders(current.parent)
-            if current.exists() and not stat.S_ISREG(current.stat().st_mode):
-                raise UserError(f"Cannot write {current}: it is not a regular file; choose another name.")
-            temporary = current.resolve().with_name(f".refine-{secrets.token_hex(8)}{current.suffix}")
-            os.close(os.open(temporary, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o666))
-            temporaries.append(temporary)
-        yield list(temporaries)
-        for temporary in temporaries:
-            with temporary.open("rb+") as file:
-                os.fsync(file.fileno())
-        with _held({temporary.parent for temporary in temporaries}):
-            leftover = list(outdated())
-            if len(targets) > 1:
-                targets[-1].resolve().unlink(missing_ok=True)
-            for current, temporary in zip(targets, temporaries, strict=True):
-                new = not current.exists()
-                os.replace(temporary, current.resolve())
-                if new:
-                    appeared.append(current)
-            for current in leftover:
-                current.unlink(missing_ok=True)
+        with contextlib.ExitStack() as stack:
+            staging: dict[Path, Path] = {}
+            for number, current in enumerate(targets):
+                created += _make_folders(current.parent)
+                if current.exists() and not stat.S_ISREG(current.stat().st_mode):
+                    raise UserError(f"Cannot write {current}: it is not a regular file; choose another name.")
+                folder = current.resolve().parent
+                if folder not in staging:
+                    staging[folder] = stack.enter_context(staging_folder(folder))
+                temporary = staging[folder] / f"{number}{current.suffix}"
+                os.close(os.open(temporary, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o666))
+                temporaries.append(temporary)
+            yield list(temporaries)
+            for temporary in temporaries:
+                with temporary.open("rb+") as file:
+                    os.fsync(file.fileno())
+            with held(staging):
+                leftover = list(outdated())
+                if len(targets) > 1:
+                    targets[-1].resolve().unlink(missing_ok=True)
+                for current, temporary in zip(targets, temporaries, strict=True):
+                    new = not current.exists()
+                    os.replace(temporary, current.resolve())
+                    if new:
+                        appeared.append(current)
+                for current in leftover:
+                    current.unlink(missing_ok=True)
+                flush(staging)
     except BaseException as error:
-        for path in temporaries + appeared:
+        for path in appeared:
             with contextlib.suppress(OSError):
                 path.unlink(missing_ok=True)
         for folder in reversed(created):
@@ -178,26 +179,6 @@ def write_together(
                 f"Cannot write {current}: {reason}; choose another folder or make room there."
             ) from error
         raise
-
-
-@contextmanager
-def _held(folders: Iterable[Path]) -> Iterator[None]:
-    """Keep other processes out of this block as long as it is about the same folders.
-
-    A folder is its own lock, which leaves nothing behind. Where there are no locks (Windows, some network
-    file systems) nothing is kept out.
-    """
-    with contextlib.ExitStack() as stack:
-        descriptors = []
-        for folder in sorted(folders) if fcntl is not None else ():
-            descriptors.append(os.open(folder, os.O_RDONLY))
-            stack.callback(os.close, descriptors[-1])
-            with contextlib.suppress(OSError):
-                fcntl.flock(descriptors[-1], fcntl.LOCK_EX)
-        yield
-        for descriptor in descriptors:
-            with contextlib.suppress(OSError):
-                os.fsync(descriptor)  # or a power cut could undo the renaming
 
 
 @contextmanager

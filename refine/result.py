@@ -143,7 +143,7 @@ def write_result(refined: Refined, output: Output, record: dict[str, Any]) -> di
 
     with write_together(list(paths.values()), outdated) as siblings:
         temporaries = dict(zip(paths, siblings, strict=True))
-        with tempfile.TemporaryDirectory(prefix=".refine-", dir=siblings[0].parent) as staging:
+        with tempfile.TemporaryDirectory(dir=siblings[0].parent) as staging:
             maps = write_maps(
                 staging,
                 output.stem,

@@ -24,9 +24,6 @@ SUFFIXES = (
 INDEX, RECORD = "index.html", "batch.json"
 """Files of a batch beside the folders of its results."""
 
-LEFTOVERS = ".refine-*"
-"""What `write_together` leaves behind when it is killed."""
-
 
 @dataclass(frozen=True)
 class Job:

@@ -14,12 +14,13 @@ from typing import Any
 from refine import __version__
 from refine.batch.cluster import work_on_cluster
 from refine.batch.index import build_index
-from refine.batch.plan import INDEX, LEFTOVERS, RECORD, Job, is_finished, plan
+from refine.batch.plan import INDEX, RECORD, Job, is_finished, plan
 from refine.batch.processes import work_in_processes
 from refine.batch.view import batch_view
-from refine.batch.work import Opening, remove_leftovers
+from refine.batch.work import Opening
 from refine.errors import StoppedError, UserError
 from refine.request import Request
+from refine.staging import remove_debris
 
 FORMAT = "svbrdf-refine batch 1"
 
@@ -60,7 +61,7 @@ def refine_batch(
 
     checkpoint = describe_checkpoint(request.init)
     jobs = plan(photos, out)
-    remove_leftovers(out.glob(LEFTOVERS))
+    remove_debris(out, unasked=True)
     outcomes: dict[Job, str | None] = {
         job: None for job in jobs if is_finished(job, request, checkpoint["sha256"])
     }

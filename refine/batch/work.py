@@ -6,15 +6,13 @@ Importing this module loads nothing heavy; opening a `Bench` does, once in every
 from __future__ import annotations
 
 import os
-import shutil
-from collections.abc import Iterable
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from refine.batch.plan import LEFTOVERS, Job
+from refine.batch.plan import Job
 from refine.errors import UserError
 from refine.request import Request, enough_memory
+from refine.staging import remove_debris
 
 if TYPE_CHECKING:
     from refine.refiner import Refiner
@@ -78,7 +76,8 @@ class Bench:
         from refine.result import SECONDS, describe, write_result
 
         request, output = self.request, self.request.output(job.folder, job.stem)
-        remove_leftovers(job.folder.rglob(LEFTOVERS))
+        for folder in (job.folder, job.folder / FOLDER):
+            remove_debris(folder, unasked=True)
         output.require_writable(job.photo)
         photo = request.read(job.photo)
         refined = request.fit(self.refiner, [photo], request.flash([job.photo]))
@@ -91,15 +90,6 @@ class Bench:
         write_result(refined, output, record)
         if request.export:
             export_folder(job.folder, list(request.export), name=job.stem, quiet=True)
-
-
-def remove_leftovers(paths: Iterable[Path]) -> None:
-    """Remove files and folders that a killed process left half written."""
-    for path in list(paths):
-        if path.is_dir():
-            shutil.rmtree(path, ignore_errors=True)
-        else:
-            path.unlink(missing_ok=True)
 
 
 def _sentence(error: Exception, job: Job) -> str:

@@ -34,7 +34,7 @@ def test_the_target_is_untouched_until_the_block_ends(tmp_path: Path) -> None:
     with write_atomically(target) as temporary:
         temporary.write_bytes(b"new")
         assert target.read_bytes() == b"old"
-        assert temporary.parent == tmp_path
+        assert temporary.parent.parent == tmp_path
         assert temporary.suffix == ".png"
     assert target.read_bytes() == b"new"
     assert os.listdir(tmp_path) == ["a.png"]

@@ -14,7 +14,7 @@ from typing import Any
 import pytest
 import torch
 
-from eval.benchmarks.kills import NAMES, SIZE, Kills, contents, examine, in_child, kill_one, write
+from eval.benchmarks.kills import NAMES, SIZE, Kills, contents, examine, in_child, is_hidden, kill_one, write
 from nets.svbrdf import SVBRDF
 from refine.errors import UserError
 from refine.files import write_together
@@ -24,7 +24,10 @@ from tests.reliability.tools import outcome_of
 
 REAL_OPEN = os.open
 
-STEPS = ((os, "open"), (os, "close"), (os, "fsync"), (os, "replace"), (Path, "write_bytes"), (Path, "open"))
+STEPS = (
+    *((os, name) for name in ("mkdir", "open", "close", "fsync", "replace", "unlink", "rmdir")),
+    *((Path, "write_bytes"), (Path, "open")),
+)
 """What a writer does to the disk."""
 
 
@@ -62,9 +65,12 @@ def test_a_writer_killed_at_any_step_leaves_old_files_or_new_ones(tmp_path: Path
         found.kills += 1
         examine(tmp_path, found)
         assert found.broken == []
-        assert set(NAMES[:-1]) <= set(os.listdir(tmp_path)) <= set(NAMES)
+        seen = {path.name for path in tmp_path.iterdir() if not is_hidden(path)}
+        assert set(NAMES[:-1]) <= seen <= set(NAMES)
+        assert len(os.listdir(tmp_path)) <= len(seen) + 1  # each removes what those before it left
     assert step >= 6 * len(NAMES)  # opened, closed, written, opened, flushed, renamed
     examine(tmp_path, found)
+    assert sorted(os.listdir(tmp_path)) == sorted(NAMES)
     assert [(tmp_path / name).read_bytes() for name in NAMES] == contents(1)
 
 
