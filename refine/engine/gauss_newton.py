@@ -201,12 +201,23 @@ def _linearised(residuals, offset: Tensor) -> tuple[Float[Tensor, "1 n h w"], Fl
 def _gain(
     jacobian: Tensor, found: Tensor, variance: Tensor, noise: float, huber: float
 ) -> tuple[Float[Tensor, "1 h w 9 n"], Float[Tensor, "1 n 9 h w"]]:
-    """Return Woodbury's `C J^T (J C J^T + S)^-1`, and `J C`, with Huber's weights in S."""
+    """Return Woodbury's `C J^T (J C J^T + S)^-1`, and `J C`, with Huber's weights in S.
+
+    Where derivatives are so large that S is lost in rounding, residuals that say the same make the matrix
+    singular: the smallest of all solutions is taken there, which is the limit of small S.
+    """
     told = jacobian * variance[:, None]
     spread = noise**2 * (found.abs() / (noise * huber)).clamp(min=1.0)
     inner = torch.einsum("bnkhw,bmkhw->bhwnm", told, jacobian)
     inner = inner + torch.diag_embed(spread.permute(0, 2, 3, 1))
-    return torch.linalg.solve(inner, told.permute(0, 3, 4, 1, 2)).transpose(-1, -2), told
+    side = told.permute(0, 3, 4, 1, 2)
+    gain, failures = torch.linalg.solve_ex(inner, side)
+    singular = (failures > 0) & inner.isfinite().all(dim=-1).all(dim=-1)
+    if bool(singular.any()):
+        rounding = inner.shape[-1] * torch.finfo(inner.dtype).eps
+        inverse = torch.linalg.pinv(inner[singular].double(), rtol=rounding, hermitian=True)
+        gain[singular] = (inverse @ side[singular].double()).to(gain.dtype)
+    return gain.transpose(-1, -2), told
 
 
 def _distance(found: Tensor) -> float:

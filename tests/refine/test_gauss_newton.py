@@ -9,11 +9,13 @@ import pytest
 import torch
 from scipy.optimize import least_squares
 
+from eval.benchmarks.cases import Seeded, draw_case
+from eval.benchmarks.soak import SIDES, check
 from losses.refinement import photo_distance
 from nets.render import PAPER, PRESETS, shade
 from nets.svbrdf import MAPS
 from refine.engine import find_solve
-from refine.engine.gauss_newton import Posterior, stack, unstack
+from refine.engine.gauss_newton import Posterior, _gain, stack, unstack
 from tests.refine.test_fused import CAMERAS, Case
 
 SOLVERS = ("reference", "fused")
@@ -168,3 +170,17 @@ def test_a_wrong_start_of_extreme_values_stays_finite() -> None:
         assert bool(torch.isfinite(stack(found.parameters)).all())
         assert bool(torch.isfinite(stack(found.deviations)).all())
         found.parameters.svbrdf().validate()
+
+
+def test_residuals_that_say_the_same_beyond_rounding_have_the_limit_of_little_noise() -> None:
+    """Then the matrix to solve is singular: equal derivatives beside which the noise is nothing."""
+    told = 1e6 * torch.arange(1.0, 10.0)
+    jacobian = told.expand(1, 3, 9)[..., None, None]
+    gain, _ = _gain(jacobian, torch.zeros(1, 3, 1, 1), torch.ones(1, 9, 1, 1), 0.1, 3.0)
+    expected = told / (3.0 * told.square().sum())
+    torch.testing.assert_close(gain[0, 0, 0], expected[:, None].expand(9, 3), rtol=1e-5, atol=0.0)
+
+
+@pytest.mark.parametrize(("number", "recipe"), [(1, "fast"), (51, "default"), (74, "several")])
+def test_what_the_soak_found_singular_is_refined(number: int, recipe: str) -> None:
+    check(draw_case(Seeded(0, number), sides=SIDES), recipe, "reference")
