@@ -25,7 +25,8 @@ from losses.reflectance import (
 )
 from losses.score import Perceptual, Score, TermWeights, exposure_gain, random_window
 from nets.color import gamma_encode
-from nets.generator import Generator, light_from_output, light_to_output, maps_to_svbrdf
+from nets.generator import Generator, maps_to_svbrdf
+from nets.light_head import light_from_output, light_to_output
 from nets.render import Camera, render
 from nets.sampling import LightDistribution
 from nets.svbrdf import CHANNELS, MAPS, SVBRDF

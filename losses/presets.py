@@ -10,10 +10,11 @@ from dataclasses import fields, is_dataclass, replace
 from typing import Any, TypeVar
 
 from losses.baselines import DES18, DES19, GAO19, RenderingObjective
+from losses.light import LightObjective
 from losses.objective import HybridObjective, L1Objective, RealObjective, SyntheticObjective
 from losses.score import TermWeights
 
-AnyObjective = L1Objective | SyntheticObjective | HybridObjective | RenderingObjective
+AnyObjective = L1Objective | LightObjective | SyntheticObjective | HybridObjective | RenderingObjective
 
 PAPER = HybridObjective()
 """Eq. 1 to 5 with the weights the paper states."""
@@ -50,7 +51,7 @@ PRESETS: dict[str, HybridObjective] = {"paper": PAPER, "as_coded": AS_CODED, "na
 BASELINES: dict[str, RenderingObjective] = {"des18": DES18, "des19": DES19, "gao19": GAO19}
 """Of the systems compared with, by name; they have no presets."""
 
-KINDS = ("l1", "synthetic", "hybrid", *BASELINES)
+KINDS = ("l1", "synthetic", "hybrid", "light", *BASELINES)
 
 T = TypeVar("T")
 
@@ -61,7 +62,8 @@ def find_objective(
     """Return an objective by name, with some values changed.
 
     Args:
-        kind: `l1` (no critics), `synthetic` (Eq. 1) or `hybrid` (Eq. 5); or one of `BASELINES`.
+        kind: `l1` (no critics), `synthetic` (Eq. 1), `hybrid` (Eq. 5) or `light` (the light encoder
+            alone); or one of `BASELINES`.
         preset: `paper`, `as_coded` or `narrow`; of meaning for `synthetic` and `hybrid` only.
         overrides: values by field name, nested as the objective is.
 
@@ -77,6 +79,7 @@ def find_objective(
         "l1": L1Objective(),
         "synthetic": hybrid.synthetic,
         "hybrid": hybrid,
+        "light": LightObjective(),
         **BASELINES,
     }
     return override(found[kind], overrides or {})

@@ -7,7 +7,6 @@ public checkpoint. What the network sees and says in plain numbers is fixed by `
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass
-from itertools import pairwise
 
 import torch
 from jaxtyping import Float
@@ -15,11 +14,11 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from nets.color import to_network_input
+from nets.light_head import LEAKY_SLOPE, LightEncoder, LightHead, light_from_output
 from nets.render import PointLight
 from nets.shading_cues import CUES, shading_cues
 from nets.svbrdf import CHANNELS, MAPS, SVBRDF
 
-LEAKY_SLOPE = 0.2
 DROPOUT = 0.5
 DROPOUT_LEVELS = 3
 """Dropout follows this many of the deepest decoder levels."""
@@ -27,17 +26,8 @@ DROPOUT_LEVELS = 3
 DETAIL_FEATURES = 2
 """Channels beyond its map that each decoder hands to the full-resolution layers."""
 
-LIGHT_HEAD_WIDTHS = (256, 128, 64, 32, 16, 3)
-
-LIGHT_MEAN = (-0.0012, 0.0018, 3.0988)
-LIGHT_DEVIATION = (1.6891, 1.6833, 2.7202)
-"""The light head predicts a standardised position: position = output x deviation + mean (surface units)."""
-
 MIN_NORMAL_Z = 0.02
 """Predicted normals are kept this far above the horizon before they are normalised."""
-
-MIN_LIGHT_Z = 0.2
-"""Predicted lights are kept this far above the surface, surface units."""
 
 MIN_ROUGHNESS = 1e-3
 """Predicted roughness is kept above this: zero is not a legal roughness."""
@@ -54,6 +44,8 @@ class GeneratorConfig:
         shading_cues: whether the network also sees `nets.shading_cues`; not in the paper.
         detail_channels: of the full-resolution layers that see decoder and input together, see `Detail`; 0
             leaves them out, as the paper does.
+        light_channels: of the first convolution of a `LightEncoder`; 0 leaves it out for the paper's head on
+            the bottleneck.
     """
 
     width: int = 64
@@ -61,6 +53,7 @@ class GeneratorConfig:
     deep_multiplier: int = 8
     shading_cues: bool = False
     detail_channels: int = 0
+    light_channels: int = 0
 
     def __post_init__(self) -> None:
         """Refuse shapes that cannot be built."""
@@ -68,6 +61,7 @@ class GeneratorConfig:
             self.width < 1
             or self.deep_multiplier < 1
             or self.detail_channels < 0
+            or self.light_channels < 0
             or not 2 <= self.levels <= 10
         ):
             raise ValueError(f"not a generator: {self}")
@@ -94,7 +88,7 @@ class GeneratorConfig:
 
 PAPER_GENERATOR = GeneratorConfig()
 NARROW_GENERATOR = GeneratorConfig(
-    width=16, levels=7, deep_multiplier=4, shading_cues=True, detail_channels=16
+    width=16, levels=7, deep_multiplier=4, shading_cues=True, detail_channels=16, light_channels=24
 )
 """What is trained on two CPU cores and shipped: see docs/architecture.md for what differs and why."""
 
@@ -197,24 +191,6 @@ class Decoder(nn.Module):
         return decoded
 
 
-class LightHead(nn.Module):
-    """Six fully connected layers from the bottleneck to a standardised light position."""
-
-    def __init__(self, inputs: int) -> None:
-        """Build for a bottleneck of `inputs` channels."""
-        super().__init__()
-        widths = (inputs, *LIGHT_HEAD_WIDTHS)
-        self.layers = nn.ModuleList(nn.Linear(inputs, outputs) for inputs, outputs in pairwise(widths))
-
-    def forward(self, bottleneck: Float[Tensor, "b c h w"]) -> Float[Tensor, "b 3"]:
-        """Return the standardised position; a bottleneck larger than 1x1 is averaged first."""
-        x = bottleneck.mean(dim=(2, 3))
-        for layer in self.layers[:-1]:
-            x = functional.leaky_relu(layer(x), LEAKY_SLOPE)
-        light: Tensor = self.layers[-1](x)
-        return light
-
-
 class Generator(nn.Module):
     """Photo to maps and light.
 
@@ -234,7 +210,9 @@ class Generator(nn.Module):
         # Neither the first nor the last level is normalised: they carry absolute levels.
         self.encoder_norms = nn.ModuleList(nn.InstanceNorm2d(width, affine=True) for width in widths[1:-1])
         self.decoders = nn.ModuleDict({name: Decoder(config, CHANNELS[name]) for name in MAPS})
-        self.light_head = LightHead(widths[-1])
+        self.light_head = (
+            LightEncoder(config.light_channels) if config.light_channels else LightHead(widths[-1])
+        )
         self.detail = Detail(config) if config.detail_channels else None
 
     def see(self, photo: Float[Tensor, "b 3 h w"]) -> Float[Tensor, "b inputs h w"]:
@@ -269,11 +247,12 @@ class Generator(nn.Module):
         if self.detail is not None:
             more = torch.cat([decoded[name][:, CHANNELS[name] :] for name in MAPS], dim=1)
             maps = maps + self.detail(maps, more, seen)
-        return torch.tanh(maps), self.light_head(features[-1])
+        return torch.tanh(maps), self.light_head(photo if self.config.light_channels else features[-1])
 
     def estimate_light(self, photo: Float[Tensor, "b 3 h w"]) -> Float[Tensor, "b 3"]:
         """Return what `forward` says of the light, without the decoders: a fifth of the work or less."""
-        light: Tensor = self.light_head(self.encode(self.see(photo))[-1])
+        alone = self.config.light_channels
+        light: Tensor = self.light_head(photo if alone else self.encode(self.see(photo))[-1])
         return light
 
     @torch.no_grad()
@@ -304,15 +283,3 @@ def svbrdf_to_maps(svbrdf: SVBRDF) -> Float[Tensor, "b 10 h w"]:
     """Invert `maps_to_svbrdf`: the network's targets in [-1, 1]."""
     scaled = svbrdf.map(lambda tensor: tensor * 2.0 - 1.0)
     return SVBRDF(svbrdf.normal, scaled.diffuse, scaled.roughness, scaled.specular).channels()
-
-
-def light_from_output(output: Float[Tensor, "b 3"]) -> PointLight:
-    """Turn the light head's standardised output into a white unit light above the surface."""
-    position = output * output.new_tensor(LIGHT_DEVIATION) + output.new_tensor(LIGHT_MEAN)
-    position = torch.cat([position[:, :2], position[:, 2:].clamp(min=MIN_LIGHT_Z)], dim=1)
-    return PointLight(position, torch.ones_like(position))
-
-
-def light_to_output(position: Float[Tensor, "b 3"]) -> Float[Tensor, "b 3"]:
-    """Standardise a light position: the light head's target."""
-    return (position - position.new_tensor(LIGHT_MEAN)) / position.new_tensor(LIGHT_DEVIATION)

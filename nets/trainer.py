@@ -26,7 +26,8 @@ class Trainer:
     """One training: call `step` until `done`; `save` and `resume` at any moment.
 
     Random numbers are a function of seed, iteration and shard alone: a resumed training draws what an
-    uninterrupted one would, and which process draws it does not matter.
+    uninterrupted one would, and which process draws it does not matter. Only the parts of the network that
+    `parts` names are trained, all if it names none.
     """
 
     network: Network
@@ -35,6 +36,7 @@ class Trainer:
     config: TrainerConfig
     critics: nn.ModuleDict = field(default_factory=nn.ModuleDict)
     team: Team = field(default_factory=Alone)
+    parts: tuple[str, ...] = ()
     iteration: int = 0
     seconds: float = 0.0
     samples: int = 0
@@ -44,7 +46,7 @@ class Trainer:
         """Place the networks and build optimizers and moving average.
 
         Raises:
-            ValueError: shards of a phase do not divide among the processes.
+            ValueError: shards of a phase do not divide among the processes, or the network lacks a part.
         """
         torch.set_flush_denormal(True)  # dying activations become denormal and several times slower
         for phase in self.config.phases:
@@ -56,13 +58,23 @@ class Trainer:
         for players in (self.network, self.critics):
             players.to(device=self.team.device, memory_format=torch.channels_last)  # type: ignore[call-overload]
         self.average = copy.deepcopy(self.network).eval().requires_grad_(False)
-        self.optimizer = self._adam(self.network)
-        self.critic_optimizer = self._adam(self.critics) if len(self.critics) else None
+        trained = [self.network.get_submodule(part) for part in self._known_parts()] or [self.network]
+        self._trained = [parameter for module in trained for parameter in module.parameters()]
+        self.network.requires_grad_(False)
+        for parameter in self._trained:
+            parameter.requires_grad_(True)
+        self.optimizer = self._adam(self._trained)
+        self.critic_optimizer = self._adam([*self.critics.parameters()]) if len(self.critics) else None
 
-    def _adam(self, players: nn.Module) -> torch.optim.Adam:
-        return torch.optim.Adam(
-            players.parameters(), lr=self.config.learning_rate, betas=(self.config.beta1, 0.999)
-        )
+    def _known_parts(self) -> tuple[str, ...]:
+        known = [name for name, _ in self.network.named_children()]
+        for part in self.parts:
+            if part not in known:
+                raise ValueError(f"the network has no {part}; it has {', '.join(known)}")
+        return self.parts
+
+    def _adam(self, parameters: list[nn.Parameter]) -> torch.optim.Adam:
+        return torch.optim.Adam(parameters, lr=self.config.learning_rate, betas=(self.config.beta1, 0.999))
 
     @property
     def done(self) -> bool:
@@ -116,7 +128,7 @@ class Trainer:
             torch.autograd.backward(
                 losses.critics * weight, inputs=list(self.critics.parameters()), retain_graph=True
             )
-        torch.autograd.backward(losses.generator * weight, inputs=list(self.network.parameters()))
+        torch.autograd.backward(losses.generator * weight, inputs=self._trained)
         return values | {name: term.detach() for name, term in losses.terms.items()}
 
     def _share(self, values: Terms) -> dict[str, float]:

@@ -35,15 +35,8 @@ from nets.data.augment import Pose, view_tile
 from nets.data.images import resize
 from nets.data.pbr import read_pbr_folder
 from nets.data.strips import read_strip, write_strip
-from nets.generator import (
-    NARROW_GENERATOR,
-    PAPER_GENERATOR,
-    Generator,
-    GeneratorConfig,
-    light_from_output,
-    light_to_output,
-    maps_to_svbrdf,
-)
+from nets.generator import NARROW_GENERATOR, PAPER_GENERATOR, Generator, GeneratorConfig, maps_to_svbrdf
+from nets.light_head import light_from_output, light_to_output
 from nets.render import (
     PRESETS,
     Camera,

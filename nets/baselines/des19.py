@@ -14,7 +14,7 @@ from torch.nn import functional
 from nets.baselines.conventions import FREE_CHANNELS, PhotoNetwork, maps_of
 from nets.baselines.des18 import STEEPEST
 from nets.baselines.unet import TrackedLayer, UNet, UNetConfig
-from nets.generator import LEAKY_SLOPE
+from nets.light_head import LEAKY_SLOPE
 from nets.render import surface_points
 
 

@@ -24,14 +24,8 @@ from nets.baselines.des19 import Des19Config
 from nets.color import gamma_encode, to_network_input
 from nets.data.pairs import PairBatch
 from nets.discriminator import Judgement
-from nets.generator import (
-    Generator,
-    GeneratorConfig,
-    light_from_output,
-    light_to_output,
-    maps_to_svbrdf,
-    svbrdf_to_maps,
-)
+from nets.generator import Generator, GeneratorConfig, maps_to_svbrdf, svbrdf_to_maps
+from nets.light_head import light_from_output, light_to_output
 from nets.render import Camera, PointLight, render
 from nets.svbrdf import CHANNELS, MAPS, SVBRDF
 from nets.trainer import Trainer
@@ -636,7 +630,7 @@ def test_critics_are_built_for_what_is_judged() -> None:
 
 def test_objectives_by_name() -> None:
     assert set(PRESETS) == {"paper", "as_coded", "narrow"}
-    assert ("l1", "synthetic", "hybrid", *BASELINES) == KINDS
+    assert ("l1", "synthetic", "hybrid", "light", *BASELINES) == KINDS
     assert find_objective("l1") == L1Objective()
     assert find_objective("synthetic", "narrow") == NARROW.synthetic
     assert find_objective("hybrid", "as_coded") == AS_CODED

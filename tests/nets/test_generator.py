@@ -7,21 +7,18 @@ import torch
 from torch import Tensor
 
 from nets.generator import (
-    MIN_LIGHT_Z,
     MIN_ROUGHNESS,
     NARROW_GENERATOR,
     PAPER_GENERATOR,
     Generator,
     GeneratorConfig,
-    LightHead,
     UpBlock,
-    light_from_output,
-    light_to_output,
     maps_to_svbrdf,
     svbrdf_to_maps,
     upsampled_convolution,
     upsampled_convolution_reference,
 )
+from nets.light_head import MIN_LIGHT_Z, LightEncoder, LightHead, light_from_output, light_to_output
 from nets.svbrdf import CHANNELS, MAPS
 from tests.helpers import assert_close, gradcheck, random_light, random_svbrdf, seeded
 
@@ -292,3 +289,28 @@ def test_light_standardisation_and_back() -> None:
     one = light_from_output(torch.ones(1, 3)).position
     assert_close(one - centre, torch.tensor([[1.6891, 1.6833, 2.7202]]))
     assert float(light_from_output(torch.full((1, 3), -9.0)).position[0, 2]) == pytest.approx(MIN_LIGHT_Z)
+
+
+@torch.no_grad()
+def test_the_light_encoder_sees_where_things_are_and_no_maps() -> None:
+    torch.manual_seed(0)
+    network = Generator(GeneratorConfig(width=2, levels=4, deep_multiplier=2, light_channels=4)).eval()
+    assert isinstance(network.light_head, LightEncoder)
+    photo = torch.rand(1, 3, 64, 32) * 2.0 - 1.0
+    output = network(photo)[1]
+    assert torch.equal(network.estimate_light(photo), output)
+    assert not torch.equal(network.estimate_light(photo.flip(-1)), output)
+    even = torch.zeros(1, 3, 256, 256)
+    spot = even.clone()
+    spot[..., 20:60, 180:220] = 1.0
+    assert not torch.allclose(network.estimate_light(spot), network.estimate_light(spot.flip(-2)), atol=1e-6)
+    assert float(light_from_output(network.estimate_light(even)).position[0, 2]) > MIN_LIGHT_Z
+
+
+@torch.no_grad()
+def test_the_light_encoder_averages_larger_photos() -> None:
+    torch.manual_seed(0)
+    encoder = LightEncoder(3)
+    small = torch.rand(2, 3, 128, 128) * 2.0 - 1.0
+    large = small.repeat_interleave(3, dim=2).repeat_interleave(3, dim=3)
+    assert_close(encoder(large), encoder(small), rtol=1e-4, atol=1e-5)

@@ -14,7 +14,8 @@ import pytest
 import torch
 from torch import Tensor, nn
 
-from nets.generator import Generator, GeneratorConfig, light_to_output, svbrdf_to_maps
+from nets.generator import Generator, GeneratorConfig, svbrdf_to_maps
+from nets.light_head import light_to_output
 from nets.render import render
 from nets.trainer import Trainer, stream_seed
 from nets.training import (

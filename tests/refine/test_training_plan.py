@@ -12,6 +12,7 @@ import pytest
 import yaml
 
 from losses.baselines import DES18, DES19, GAO19
+from losses.light import LightObjective
 from losses.objective import HybridObjective, L1Objective, SyntheticObjective
 from losses.presets import NARROW, PAPER, override
 from nets.baselines.autoencoder import NARROW_AUTOENCODER
@@ -54,8 +55,8 @@ def test_the_paper_s_plan_has_the_paper_s_numbers() -> None:
 def test_the_narrow_plan_is_of_the_network_that_is_shipped() -> None:
     plan = read_plan(CONFIGS / "narrow.yaml")
     assert {stage.network for stage in plan.stages} == {NARROW_GENERATOR}
-    assert [stage.name for stage in plan.stages] == ["l1", "syn", "hyb"]
-    kinds = (L1Objective, SyntheticObjective, HybridObjective)
+    assert [stage.name for stage in plan.stages] == ["l1", "syn", "hyb", "light"]
+    kinds = (L1Objective, SyntheticObjective, HybridObjective, LightObjective)
     for stage, kind in zip(plan.stages, kinds, strict=True):
         assert isinstance(stage.objective, kind)
         assert {phase.shards for phase in stage.trainer.phases} == {2}

@@ -1,0 +1,92 @@
+"""The light encoder's objective: closed forms, gradients, and that training moves nothing else."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+from torch import Tensor, nn
+
+from losses.light import LightObjective, angle_between, log_ratio
+from nets.generator import Generator, GeneratorConfig
+from nets.light_head import light_to_output
+from nets.render import render
+from nets.trainer import Trainer
+from nets.training import Phase, TrainerConfig, TrainingBatch
+from tests.helpers import gradcheck, random_light, random_svbrdf, seeded
+
+TINY = GeneratorConfig(width=2, levels=4, deep_multiplier=2, light_channels=4)
+
+
+def batch_of(size: int = 32, count: int = 2, seed: int = 0) -> TrainingBatch:
+    truth, light = random_svbrdf(count, size, size, seed=seed), random_light(count, seed=seed)
+    return TrainingBatch(render(truth, light).clamp(0.0, 1.0), truth, light)
+
+
+@pytest.mark.parametrize("degrees", [1e-3, 5.0, 90.0, 140.0])
+def test_the_angle_between_vectors_is_that_of_the_turn(degrees: float) -> None:
+    turn = math.radians(degrees)
+    a = torch.tensor([[0.0, 0.0, 3.0]], dtype=torch.float64)
+    b = 0.5 * torch.tensor([[math.sin(turn), 0.0, math.cos(turn)]], dtype=torch.float64)
+    assert float(angle_between(a, b)) == pytest.approx(turn, rel=1e-9)
+    assert float(angle_between(b, a)) == pytest.approx(turn, rel=1e-9)
+
+
+def test_distances_are_compared_by_their_ratio() -> None:
+    a, b = torch.tensor([[3.0, 0.0, 4.0]]), torch.tensor([[0.0, 0.0, 1.0]])
+    assert float(log_ratio(a, b)) == pytest.approx(math.log(5.0))
+    assert float(log_ratio(b, a)) == pytest.approx(math.log(5.0))
+
+
+def test_gradients_of_both_terms() -> None:
+    generator = torch.Generator().manual_seed(0)
+    a, b = torch.randn(2, 4, 3, generator=generator, dtype=torch.float64)
+    gradcheck(lambda x: angle_between(x, b), a)
+    gradcheck(lambda x: log_ratio(x, b), a)
+
+
+@pytest.mark.parametrize("weight", [0.0, 0.7])
+def test_the_objective_is_the_sum_of_its_terms_and_zero_at_the_truth(weight: float) -> None:
+    batch = batch_of()
+
+    class Says(Generator):
+        def __init__(self, position: Tensor) -> None:
+            super().__init__(TINY)
+            self.position = position
+
+        def estimate_light(self, photo: Tensor) -> Tensor:
+            return light_to_output(self.position)
+
+    right = LightObjective(weight)(Says(batch.light.position), nn.ModuleDict(), batch, seeded(0))
+    assert float(right.generator) == pytest.approx(0.0, abs=2e-3)  # float32 near an angle of zero
+    wrong = batch.light.position * torch.tensor([-1.5, 0.5, 2.0])
+    found = LightObjective(weight)(Says(wrong), nn.ModuleDict(), batch, seeded(0))
+    cosine = nn.functional.cosine_similarity(wrong, batch.light.position)
+    ratio = wrong.norm(dim=1) / batch.light.position.norm(dim=1)
+    expected = float(cosine.acos().mean() + weight * ratio.log().abs().mean())
+    assert float(found.generator) == pytest.approx(expected, rel=1e-5)
+    assert found.critics is None
+
+
+def test_training_the_light_lowers_its_error_and_leaves_the_maps_alone() -> None:
+    torch.manual_seed(0)
+    network = Generator(TINY)
+    before = {name: value.clone() for name, value in network.state_dict().items()}
+    config = TrainerConfig((Phase(60, 32, 4),), learning_rate=3e-3, warmup=1)
+
+    def source(count: int, crop: int, generator: torch.Generator) -> TrainingBatch:
+        return batch_of(crop, count, int(torch.randint(4, (1,), generator=generator)))
+
+    objective = LightObjective()
+    trainer = Trainer(network, source, objective, config, parts=objective.trains)
+    losses = [trainer.step()["loss"] for _ in range(config.iterations)]
+    assert sum(losses[-10:]) < 0.7 * sum(losses[:10])
+    for name, value in network.state_dict().items():
+        assert torch.equal(value, before[name]) != name.startswith("light_head."), name
+
+
+def test_a_part_that_is_not_there_is_named() -> None:
+    config = TrainerConfig((Phase(1, 32, 1),))
+    with pytest.raises(ValueError, match=r"the network has no light_hat; it has encoder, .*light_head"):
+        Trainer(Generator(TINY), lambda *_: batch_of(), LightObjective(), config, parts=("light_hat",))
