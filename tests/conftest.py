@@ -1,16 +1,23 @@
 """What holds for the whole suite: shapes are checked at run time, randomness is seeded, threads are few.
 
-The import hook must run before the first import of the library, so it stands at the top of this file.
+The import hook must run before the first import of the library, so it stands at the top of this file. Plain
+`pytest` shares the tests between two processes (`addopts` in pyproject.toml); `-n 0` has them in this one.
 """
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterator
+
+if "PYTEST_XDIST_WORKER" in os.environ:  # the workers share the cores; libraries read this when they load
+    for variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
+        os.environ.setdefault(variable, "1")
 
 import jaxtyping
 
-# An int is a float, as for mypy. (jaxtyping wants source text; it may be any expression of one import.)
-CHECKER = "beartype.beartype(conf=beartype.BeartypeConf(is_pep484_tower=True))"
+import tests.type_checks
+
+CHECKER = f"{tests.type_checks.__name__}.checked"  # jaxtyping wants source text
 jaxtyping.install_import_hook(["nets", "losses", "refine", "eval"], CHECKER)
 
 import hypothesis  # noqa: E402

@@ -69,7 +69,8 @@ def test_known_lights_are_kept(kind: str, photos: list[str], checkpoint: Path, t
         width = 0.5  # of which the surface's longer side, 2, is four times as much
         (source / "calib.json").write_text(json.dumps({"camera_pos": POSITIONS, "im_size": width}))
     out = tmp_path / "out"
-    assert run(checkpoint, *photos, "--one-surface", "--lights", str(source), "--out", str(out)) == 0
+    options = ("--one-surface", "--no-report", "--lights", str(source), "--out", str(out))
+    assert run(checkpoint, *photos, *options) == 0
     record = json.loads((out / "00.json").read_text())
     found = [entry["light"]["position"] for entry in (record, *record["others"])]
     assert np.allclose(found, POSITIONS, atol=1e-6)
