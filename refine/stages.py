@@ -173,7 +173,7 @@ class Recipe:
 
     Attributes:
         name: how it is asked for.
-        light_fit: how an unknown light is found; None takes the light head's word.
+        light_fit: how an unknown light is found; None takes the network's word.
         stages: in order.
     """
 
@@ -235,13 +235,14 @@ RECIPES: dict[str, Recipe] = {
     "default": Recipe("default", stages=(LONG_GLOBAL, PosteriorStage())),
     "paper": Recipe("paper", stages=(GlobalStage(), PixelStage())),
     "several": Recipe("several", stages=(LONG_GLOBAL, MANY_PHOTOS)),
-    "fast": Recipe("fast", light_fit=None, stages=(PosteriorStage(iterations=3),)),
+    "fast": Recipe("fast", light_fit=LightFit(evaluations=0), stages=(PosteriorStage(iterations=3),)),
     "gao": Recipe("gao", stages=(LatentStage(),)),
     "gao+": Recipe("gao+", stages=(LatentStage(), GAO_PIXELS)),
 }
 """By name. `default` is the best there is for one photo, and `several` takes its place for more. `paper` is
-Ours+ of Table 1: global roughness and specular, then every map per pixel. `fast` believes the light head and
-takes three steps: real time. `gao` and `gao+` are Gao19 and Gao19+ of Table 1; they start from `des19`."""
+Ours+ of Table 1: global roughness and specular, then every map per pixel. `fast` believes the network's
+direction of the light and takes three steps: real time. `gao` and `gao+` are Gao19 and Gao19+ of Table 1; they
+start from `des19`."""
 
 
 def find_recipe(name: str) -> Recipe:

@@ -22,7 +22,7 @@ from nets.ensemble import FlipAverage
 from nets.render import Camera, PointLight, render
 from nets.svbrdf import SVBRDF
 from refine import Refined, Refiner
-from refine.light import check_falloff
+from refine.light import LightFit, check_falloff, starting_light
 from refine.stages import RECIPES, Recipe
 from tests.e2e.pictures import save_picture
 
@@ -187,3 +187,35 @@ def test_a_photo_of_nothing_leaves_the_light_near_its_guess() -> None:
 def test_the_fit_is_the_same_twice(tmp_path: Path) -> None:
     first, second = (fitted(tmp_path, iters=1)[0] for _ in range(2))
     assert torch.equal(first.light.position, second.light.position)
+
+
+@pytest.mark.parametrize("height", [0.9, 2.0, 6.0])
+def test_the_fit_starts_at_the_cameras_height(height: float) -> None:
+    direction = torch.tensor([0.3, -0.2, 1.0])
+    guess = PointLight((direction * height)[None], torch.full((1, 3), 0.7), "inverse_square")
+    found = starting_light(guess, Camera(position=(0.5, 0.0, 3.0)))
+    torch.testing.assert_close(found.position[0], direction * 3.0)
+    assert (found.intensity is guess.intensity, found.falloff) == (True, "inverse_square")
+    for kind in ("orthographic", "collocated"):
+        assert starting_light(guess, Camera(kind)) is guess  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("at_camera", [True, False])
+def test_without_evaluations_the_light_stays_where_it_starts(at_camera: bool, tmp_path: Path) -> None:
+    fit = LightFit(flash_at_camera=at_camera, evaluations=0)
+    still = Recipe("still", light_fit=fit, stages=RECIPES["paper"].stages)
+    for falloff in (None, "auto"):
+        refined, guess = fitted(tmp_path, iters=1, recipe=still, falloff=falloff)
+        start = starting_light(guess, Camera()) if at_camera else guess
+        assert torch.equal(refined.light.position, start.position)
+
+
+@pytest.mark.parametrize("name", ["hammered_metal", "leather", "slate"])
+def test_a_material_that_explains_little_does_not_move_the_flash(name: str, tmp_path: Path) -> None:
+    truth = PointLight.at((0.0, 0.0, 2.14))
+    photo = saved(tmp_path, material(name), truth)
+    flat = material(name)
+    up = torch.tensor([0.0, 0.0, 1.0])[:, None, None].expand_as(flat.normal)
+    wrong = replace(flat, normal=up, roughness=flat.roughness * 0.6)
+    found = Refiner(knows(wrong, PointLight.at((0.1, -0.1, 3.1)))).fit(photo, iters=1).light
+    assert error(found, truth) < 0.1
