@@ -241,8 +241,8 @@ RECIPES: dict[str, Recipe] = {
 }
 """By name. `default` is the best there is for one photo, and `several` takes its place for more. `paper` is
 Ours+ of Table 1: global roughness and specular, then every map per pixel. `fast` believes the network's
-direction of the light and takes three steps: real time. `gao` and `gao+` are Gao19 and Gao19+ of Table 1; they
-start from `des19`."""
+direction of the light and takes three steps: real time. `gao` and `gao+` are Gao19 and Gao19+ of Table 1;
+they start from `des19`."""
 
 
 def find_recipe(name: str) -> Recipe:
