@@ -7,6 +7,8 @@ for standard_surface the graph computes the index. (A dark tint alone would dark
 
 from __future__ import annotations
 
+import re
+
 import MaterialX as mx
 
 from refine.export.bundle import TEXTURES, Bundle, Source
@@ -53,9 +55,15 @@ def materialx(source: Source) -> Bundle:
     )  # fmt: skip
     shown = from_layered(source.svbrdf, layered_base_color(source.svbrdf))
     return Bundle(
-        {f"{source.stem}.mtlx": mx.writeToXmlString(document), **source.textures(*_TYPES)},
+        {f"{source.stem}.mtlx": _xml(document), **source.textures(*_TYPES)},
         {"ior": split.ior, "loss": loss(source.svbrdf, shown)},
     )
+
+
+def _xml(document: mx.Document) -> str:
+    """Return the document as XML; MaterialX leaves `<` in attributes, which other readers do not take."""
+    text: str = mx.writeToXmlString(document)
+    return re.sub(r'="[^"]*"', lambda attribute: attribute[0].replace("<", "&lt;"), text)
 
 
 def _image(graph: mx.NodeGraph, source: Source, name: str) -> mx.Node:

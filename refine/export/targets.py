@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from importlib import import_module
@@ -17,6 +18,9 @@ if TYPE_CHECKING:
     from refine.maps import MapFormat
 
 FORMAT = "svbrdf-refine export 1"
+
+UNREADABLE = re.compile(r"\\|:SDF_FORMAT_ARGS:")
+"""What MaterialX and USD take for something else than a part of a file's name."""
 
 
 @dataclass(frozen=True)
@@ -89,7 +93,7 @@ def export_material(
     Args:
         svbrdf: one material (a batch of one).
         folder: created if missing; files of the same names are replaced.
-        stem: beginning of every file name.
+        stem: beginning of every file name, but that `UNREADABLE` parts are replaced in all but the record's.
         targets: names in `TARGETS`.
         format: of pictures that are files of their own; 16-bit PNG unless said otherwise.
         tile: whether the material is made seamless first.
@@ -111,7 +115,8 @@ def export_material(
 
     names = parse_targets("target", ",".join(targets))
     format = format or MapFormat()
-    source = Source(make_seamless(svbrdf) if tile else svbrdf, stem, format, repeats=tile)
+    shown = UNREADABLE.sub("_", stem)
+    source = Source(make_seamless(svbrdf) if tile else svbrdf, shown, format, repeats=tile)
     bundles = {name: TARGETS[name].bundle(source) for name in names}
     height, width = source.svbrdf.size
     record = {
