@@ -19,7 +19,7 @@ class LightObjective:
     """Angle between true and estimated direction, and the difference of the logarithms of distances.
 
     Eq. 1's L1 of positions is led by far lights, which look alike; how a surface is shaded depends on the
-    direction first. Everything but the light encoder stays as it is.
+    direction first.
 
     Attributes:
         distance_weight: of the distances' term; the angle, in radians, weighs 1.
@@ -31,11 +31,6 @@ class LightObjective:
     def judged(self) -> dict[str, int]:
         """No critics."""
         return {}
-
-    @property
-    def trains(self) -> tuple[str, ...]:
-        """Parts of the network that are trained; the others are frozen."""
-        return ("light_head",)
 
     def as_dict(self) -> dict[str, Any]:
         """Return plain data for a checkpoint's header."""

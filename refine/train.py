@@ -9,7 +9,6 @@ from typing import Annotated, Any
 import torch
 import typer
 
-from losses.light import LightObjective
 from losses.score import build_critics
 from losses.vgg_weights import load_vgg16
 from losses.with_vgg import give_vgg, needs_vgg
@@ -145,7 +144,7 @@ def train(
                 replace(one.trainer, seed=seed),
                 build_critics(objective.judged, **plan.critics),
                 team,
-                objective.trains if isinstance(objective, LightObjective) else (),
+                one.parts,
             )
             folder = out / one.name
             origin = origins[one.name]

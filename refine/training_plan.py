@@ -34,6 +34,7 @@ class Stage:
         objective: what is minimised.
         trainer: phases, learning rates, seed.
         pairs: real pairs per shard.
+        parts: of the network that are trained, as the generator calls them (`light_head`); none names all.
     """
 
     name: str
@@ -41,6 +42,7 @@ class Stage:
     objective: AnyObjective
     trainer: TrainerConfig
     pairs: int = 0
+    parts: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -70,6 +72,7 @@ class TrainingPlan:
             "objective": stage.objective.as_dict(),
             "critics": dict(self.critics),
             "pairs": stage.pairs,
+            "parts": list(stage.parts),
             "shares": dict(self.shares),
             "augmentation": asdict(self.augmentation),
             "photography": asdict(self.photography),
@@ -140,7 +143,7 @@ OPTIONAL = ("generator", "critics", "trainer", "shares", "augmentation", "photog
 
 
 def _stage(content: Any, common: Mapping[str, Any], generator: NetworkConfig | None) -> Stage:
-    required, optional = ("name", "objective", "phases"), ("network", "trainer", "pairs")
+    required, optional = ("name", "objective", "phases"), ("network", "trainer", "pairs", "parts")
     entries = _mapping(content, "a stage", required=required, optional=optional)
     name = str(entries["name"])
     where = f"stage {name}"
@@ -173,7 +176,10 @@ def _stage(content: Any, common: Mapping[str, Any], generator: NetworkConfig | N
     pairs = entries.get("pairs", 0)
     if type(pairs) is not int or pairs < 0 or bool(pairs) != isinstance(objective, HybridObjective):
         raise ValueError(f"{where}: pairs must be at least 1 with a hybrid objective and 0 with others")
-    return Stage(name, network, objective, trainer, pairs)
+    parts = entries.get("parts", [])
+    if not isinstance(parts, list) or not all(isinstance(part, str) for part in parts):
+        raise ValueError(f"{where}: parts must be a list of the network's parts, got {parts!r}")
+    return Stage(name, network, objective, trainer, pairs, tuple(parts))
 
 
 def _network(content: Any, where: str) -> NetworkConfig:

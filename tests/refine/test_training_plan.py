@@ -15,6 +15,7 @@ from losses.baselines import DES18, DES19, GAO19
 from losses.light import LightObjective
 from losses.objective import HybridObjective, L1Objective, SyntheticObjective
 from losses.presets import NARROW, PAPER, override
+from nets.architectures import build
 from nets.baselines.autoencoder import NARROW_AUTOENCODER
 from nets.baselines.des18 import NARROW_DES18
 from nets.baselines.des19 import NARROW_DES19
@@ -55,13 +56,18 @@ def test_the_paper_s_plan_has_the_paper_s_numbers() -> None:
 def test_the_narrow_plan_is_of_the_network_that_is_shipped() -> None:
     plan = read_plan(CONFIGS / "narrow.yaml")
     assert {stage.network for stage in plan.stages} == {NARROW_GENERATOR}
-    assert [stage.name for stage in plan.stages] == ["l1", "syn", "hyb", "light"]
-    kinds = (L1Objective, SyntheticObjective, HybridObjective, LightObjective)
+    assert [stage.name for stage in plan.stages] == ["l1", "syn", "light", "hyb"]
+    kinds = (L1Objective, SyntheticObjective, LightObjective, HybridObjective)
     for stage, kind in zip(plan.stages, kinds, strict=True):
         assert isinstance(stage.objective, kind)
         assert {phase.shards for phase in stage.trainer.phases} == {2}
     assert plan.stages[1].objective == NARROW.synthetic
-    assert plan.stages[2].objective == NARROW
+    real = {"camera": {"kind": "collocated"}, "rendering": {"perceptual": 1.0}, "perceptual_layers": 3}
+    changes = {"synthetic": {"maps": {"adversarial": 0.1}}, "real": real, "real_weight": 1.0}
+    assert plan.stages[3].objective == override(NARROW, changes)
+    light, others = ({*stage.parts} for stage in plan.stages[2:])
+    assert light == {"light_head"}
+    assert others | light == {name for name, _ in build(NARROW_GENERATOR).named_children()}
     assert plan.precision == "bf16-mixed"
 
 
@@ -83,7 +89,8 @@ def test_what_a_header_is_told_is_plain_data(path: Path) -> None:
         told = plan.as_dict(stage)
         assert json.loads(json.dumps(told, allow_nan=False))["stage"] == stage.name
         assert set(told) == {
-            "stage", "objective", "critics", "pairs", "shares", "augmentation", "photography", "precision",
+            "stage", "objective", "critics", "pairs", "parts", "shares", "augmentation", "photography",
+            "precision",
         }  # fmt: skip
 
 
@@ -187,6 +194,11 @@ MISTAKES: list[tuple[str, Any, str]] = [
     ("stages/0/phases/0/iterations", 1e5, "iterations must be a whole number from 1 on, got 100000.0"),
     ("stages/0/phases/0/crop", 20, "stage syn has a crop of 20 pixels; its network needs multiples of 8"),
     ("stages/0/trainer", {"beta1": 2.0}, "beta1 must be from 0 to below 1, got 2.0"),
+    (
+        "stages/0/parts",
+        "light_head",
+        "stage syn: parts must be a list of the network's parts, got 'light_head'",
+    ),
     ("stages/0/pairs", 1, "stage syn: pairs must be at least 1 with a hybrid objective and 0 with others"),
     ("stages/1/pairs", 0, "stage hyb: pairs must be at least 1 with a hybrid objective and 0 with others"),
     ("stages/1/pairs", True, "stage hyb: pairs must be at least 1 with a hybrid objective"),
