@@ -269,8 +269,11 @@ def test_a_folder_can_show_one_surface(checkpoint: Path, tmp_path: Path) -> None
     folder.mkdir()
     for name in ("1.png", "2.png"):
         save_picture(folder / name, flash_photo(24, 24))
+    lights = tmp_path / "lights.json"  # given: finding them takes long and is another's test
+    lights.write_text(json.dumps({"positions": [[0.0, 0.1, 2.0], [0.9, 0.1, 2.0]]}))
     out = tmp_path / "out"
-    options = ("--one-surface", "--init", str(checkpoint), *OPTIONS, "--quiet", "--out", str(out))
+    known = ("--one-surface", "--lights", str(lights), "--threads", "1")
+    options = (*known, "--init", str(checkpoint), *OPTIONS, "--quiet", "--out", str(out))
     assert refine.cli.run([str(folder), *options]) == 0
     record = json.loads((out / "1.json").read_text())
     assert [other["source"] for other in record["others"]] == [str(folder / "2.png")]
