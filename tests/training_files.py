@@ -33,6 +33,7 @@ STAGES: dict[str, dict[str, Any]] = {
         "phases": PHASES,
         "pairs": 1,
     },
+    "light": {"name": "light", "objective": {"kind": "light"}, "parts": ["light_head"], "phases": PHASES},
     "des18": {
         "name": "des18",
         "network": {"kind": "des18", **GENERATOR},

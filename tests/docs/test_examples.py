@@ -48,7 +48,9 @@ def inputs(tmp_path_factory: pytest.TempPathFactory) -> Path:
     write_surface(folder / "surfaces" / "wall", material(0), "calib.json")
     write_pairs(folder / "pairs")
     once = [{"iterations": 1, "crop": 16, "batch": 2}]
-    write_plan(folder / "tiny.yaml", *({**STAGES[name], "phases": once} for name in ("l1", "syn", "hyb")))
+    write_plan(
+        folder / "tiny.yaml", *({**STAGES[name], "phases": once} for name in ("l1", "syn", "light", "hyb"))
+    )
     return folder
 
 
