@@ -6,8 +6,12 @@ const canvas = $$("canvas"), stage = $$("stage");
 const given = new URLSearchParams(location.hash.slice(1));
 const bare = given.has("bare"); // a pixel of the maps for a pixel of the screen, and nothing else
 const title = (text) => text[0].toUpperCase() + text.slice(1);
+const signed = (value) => {
+  const size = Math.abs(value).toFixed(1);
+  return Number(size) ? `${value < 0 ? "−" : "+"}${size}` : size;
+};
 const numbers = (text, count) => {
-  const values = (text ?? "").split(",").map(Number);
+  const values = (text ?? "").split(",").map((part) => (part.trim() ? Number(part) : NaN)); // Number("") is 0
   return values.length === count && values.every(Number.isFinite) ? values : null;
 };
 
@@ -91,7 +95,7 @@ function refresh() {
   $$("height").value = Math.log(state.light.position[2]);
   $$("height-value").value = state.light.position[2].toFixed(2);
   $$("exposure").value = state.exposure;
-  $$("exposure-value").value = `${state.exposure < 0 ? "−" : "+"}${Math.abs(state.exposure).toFixed(1)}`;
+  $$("exposure-value").value = signed(state.exposure);
   canvas.dataset.mode = state.mode;
   schedule();
   clearTimeout(written);
@@ -260,7 +264,7 @@ const arrow = (dx, dy) => {
 // ---- keys
 
 const KEYS = [
-  ["1 – 5", "rendering, normal, diffuse, specular, roughness"],
+  ["1 – 5", "rendering, normal, diffuse, roughness, specular"],
   ["L  O", "dragging moves the light, or walks around the surface"],
   ["← → ↑ ↓", "the same, by keys"],
   ["Page ↑ ↓", "raise or lower the light"],

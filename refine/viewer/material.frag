@@ -8,7 +8,7 @@ precision highp sampler2D;
 const float PI = 3.14159265358979;
 
 uniform sampler2D normalMap, diffuseMap, specularMap, roughnessMap;
-uniform int shown;            // 0 rendering, 1 normal, 2 diffuse, 3 specular, 4 roughness
+uniform int shown;            // 0 rendering, 1 normal, 2 diffuse, 3 roughness, 4 specular
 uniform vec3 lightPosition, lightIntensity;
 uniform bool inverseSquare;
 uniform vec4 eye;             // w = 1: a position; w = 0: a direction
@@ -72,7 +72,7 @@ void main() {
   vec3 color = brdf * nDotL * irradiance * exposure;
   if (shown == 1) color = linear(encodedNormal);
   if (shown == 2) color = diffuse;
-  if (shown == 3) color = specular;
-  if (shown == 4) color = linear(vec3(roughness));
+  if (shown == 3) color = linear(vec3(roughness));
+  if (shown == 4) color = specular;
   result = vec4(clamp(color, 0.0, 1.0), 1.0);
 }

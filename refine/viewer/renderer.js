@@ -1,6 +1,6 @@
 // WebGL2 in two passes: a material is shaded at the pixels of its maps, then the surface is drawn with it.
 
-const MAPS = ["rendering", "normal", "diffuse", "specular", "roughness"];
+const MAPS = ["rendering", "normal", "diffuse", "roughness", "specular"];
 
 class Renderer {
   constructor(canvas, shaders) {
