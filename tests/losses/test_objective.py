@@ -11,7 +11,6 @@ import torch
 from torch import Tensor, nn
 
 from losses.adversarial import accuracy, discriminator_loss, feature_matching, generator_loss
-from losses.light import LightObjective
 from losses.objective import HybridObjective, L1Objective, RealObjective, SyntheticObjective
 from losses.presets import AS_CODED, BASELINES, KINDS, NARROW, PAPER, PRESETS, find_objective, override
 from losses.reflectance import encoded_difference, log_l1, rendering_pair
@@ -715,16 +714,14 @@ STAGES = {
     "maps": find_objective("synthetic", "paper", {"rendering_weight": 0.0}),
     "syn": replace(PAPER.synthetic, perceptual=difference),
     "hyb": replace(PAPER, synthetic=replace(PAPER.synthetic, perceptual=difference)),
-    "light": LightObjective(),
     **{name: replace(objective, stride=1) for name, objective in BASELINES.items()},
 }
 NETWORKS: dict[str, NetworkConfig] = {
     "des18": Des18Config(width=4, levels=2, deep_multiplier=2),
     "des19": Des19Config(width=4, levels=2, deep_multiplier=2),
     "gao19": AutoencoderConfig(width=4),
-    "light": GeneratorConfig(width=4, levels=2, deep_multiplier=2, light_channels=4),
 }
-"""Other than the plain generator."""
+"""Other than the generator."""
 
 
 @pytest.mark.usefixtures("unchecked")  # which takes a third of the time
@@ -765,7 +762,6 @@ def test_200_iterations_of_every_stage_improve_its_objective(name: str) -> None:
             "des18": {"rendering"},
             "des19": {*MAPS, "rendering"},
             "gao19": {*MAPS, "rendering"},
-            "light": {"direction", "distance"},
         }[name]
     )
     assert all(after[key] < before[key] for key in before)
