@@ -56,7 +56,8 @@ def figures(
     with mistakes():
         chosen = _numbers(only)
         require_format(format)
-        compared = [method.name for method in choose((rows or ",".join(COMPARED)).split(","))]
+        compared = list(dict.fromkeys(rows.split(","))) if rows else list(COMPARED)
+        choose(compared)
         found, gaps = find_weights(choose(None), parse_inits(init or []), quick=quick)
         synthetic = Synthetic(Synthetic.named(test_set), Settings(size=size, seed=seed), flips=flips)
         synthetic.scenes()

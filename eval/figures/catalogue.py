@@ -146,7 +146,7 @@ _ALL = (
     ),
     PaperFigure(
         6,
-        "The true material under the light that the network of Ours_hyb finds in the photo, and the photo.",
+        "The photo, and the true material under the light that the network of Ours_hyb finds in it.",
         {"lights": _fig6},
         rows=("Ours_hyb",),
     ),

@@ -48,7 +48,7 @@ def renderings(answers: Answers, indices: Sequence[int], names: Sequence[str], l
             for name in names:
                 pictures.append(_compared(_lit(answers, name, index, light), truth, lpips))
             lines.append((f"light {number + 1}", pictures))
-    return grid(("photo", "truth", *names), lines)
+    return grid(("photo", "truth", *names), lines, begins=range(0, len(lines), LIGHTS))
 
 
 def real_renderings(answers: Answers, indices: Sequence[int], names: Sequence[str], lpips: LPIPS) -> Sheet:
@@ -58,11 +58,12 @@ def real_renderings(answers: Answers, indices: Sequence[int], names: Sequence[st
         scene: RealScene = answers.scene(index)
         for number in _spread_lights(scene):
             truth = scene.held_out[number : number + 1]
-            photo = Picture(as_seen(scene.photo.linear), scene.name)
+            photo = Picture(as_seen(scene.photo.linear), scene.name) if number == 0 else Picture(None)
             pictures = [photo, Picture(as_seen(truth))]
             pictures += [_compared(_real(answers, name, index, number), truth, lpips) for name in names]
             lines.append((f"photo {number + 1}", pictures))
-    return grid(("given", "held out", *names), lines)
+    begins = [number for number, (_, pictures) in enumerate(lines) if pictures[0].image is not None]
+    return grid(("given", "held out", *names), lines, begins)
 
 
 def two_rows(answers: Answers, indices: Sequence[int], names: Sequence[str], lpips: LPIPS) -> Sheet:
@@ -74,14 +75,14 @@ def two_rows(answers: Answers, indices: Sequence[int], names: Sequence[str], lpi
     for index in indices:
         scene = answers.scene(index)
         known = scene.truth if isinstance(scene, Scene) else None
-        lines.append((scene.name, _truth_line(scene, known)))
+        lines.append(("photo" if known is None else "truth", _truth_line(scene, known)))
         truth = _truth_rendering(scene)
         for name in names:
             material = _svbrdf(answers, name, index)
             pictures = [Picture(None), *(_map(material, map_name, known) for map_name in MAPS)]
             pictures.append(_compared(_rendering(answers, name, index), truth, lpips))
             lines.append((name, pictures))
-    return grid(("photo", *MAPS, "rendering"), lines)
+    return grid(("photo", *MAPS, "rendering"), lines, begins=range(0, len(lines), 1 + len(names)))
 
 
 def worst(answers: Answers, indices: Sequence[int], name: str, count: int, lpips: LPIPS) -> list[int]:
@@ -146,7 +147,7 @@ def _truth_rendering(scene: Any) -> torch.Tensor:
 def _truth_line(scene: Any, known: SVBRDF | None) -> list[Picture]:
     photo = scene.photo.linear if isinstance(scene, RealScene) else scene.photo
     maps_of_truth = [Picture(None, "not known") if known is None else _map(known, name) for name in MAPS]
-    return [Picture(as_seen(photo)), *maps_of_truth, Picture(as_seen(_truth_rendering(scene)))]
+    return [Picture(as_seen(photo), scene.name), *maps_of_truth, Picture(as_seen(_truth_rendering(scene)))]
 
 
 def _spread_lights(scene: RealScene) -> list[int]:

@@ -29,14 +29,18 @@ ANGLES = (0.0, 10.0, 20.0, 30.0, 35.0, 40.0, 50.0, 60.0)
 DIFFERENCE_GAIN = 4.0
 """Differences are shown this much brighter than they are."""
 
+MAP_COLORS = {"normal": "#1f6f8b", "diffuse": "#c0562b", "roughness": "#5b8c3e", "specular": "#7a4f9a"}
+RENDERING_COLORS = {"rendering": "#202020", "lpips": "#c79a1e"}
+"""Of the lines of Fig. 12, by what they show."""
+
 BANDS = ((0.0, 15.0), (15.0, 25.0), (25.0, 35.0))
 """Bands of angles that the flashes of Fig. 6 are drawn from, one for each scene in turn."""
 
 
 def found_lights(answers: Answers, indices: Sequence[int], name: str) -> Sheet:
-    """Fig. 6: the true material under the light that a row's network finds, beside the photo.
+    """Fig. 6: the photo, beside the true material under the light that a row's network finds.
 
-    Below: error of the direction and of the distance, RMSE of the picture.
+    Below: the light's angle, error of the direction and of the distance, RMSE of the picture.
     """
     model = answers.refiner(name).model
     lines = []
@@ -52,12 +56,12 @@ def found_lights(answers: Answers, indices: Sequence[int], name: str) -> Sheet:
         difference = (gamma_encode(again) - gamma_encode(photo)).abs() * DIFFERENCE_GAIN
         off = math.degrees(math.atan2(math.hypot(x, y), z))
         pictures = [
-            Picture(as_seen(again), f"{direction:.1f}° off, distance {100 * distance:.0f} % off"),
             Picture(as_seen(photo), f"light {off:.0f}° off centre"),
+            Picture(as_seen(again), f"{direction:.1f}° off, distance {100 * distance:.0f} % off"),
             Picture(difference, f"RMSE {rendering_rmse(again, photo):.3f}"),
         ]
         lines.append((scene.name, pictures))
-    return grid(("found light", "photo", f"difference x {DIFFERENCE_GAIN:g}"), lines)
+    return grid(("photo", "found light", f"difference x {DIFFERENCE_GAIN:g}"), lines)
 
 
 @dataclass(frozen=True)
@@ -110,18 +114,16 @@ def plot_angles(scores: Sequence[AngleScores]) -> Figure:
     with matplotlib.style.context("default"):
         figure = Figure(figsize=(PAGE_WIDTH, 2.3), dpi=DPI, facecolor="white", layout="constrained")
         left, right = figure.subplots(1, 2)
-        for axes, columns in (
-            (left, ("normal", "diffuse", "roughness", "specular")),
-            (right, ("rendering", "lpips")),
-        ):
-            for column, color in zip(columns, ("#c0562b", "#1f6f8b", "#5b8c3e", "#7a4f9a"), strict=False):
+        for axes, columns in ((left, MAP_COLORS), (right, RENDERING_COLORS)):
+            for column, color in columns.items():
                 for row, style in zip(rows, ("-", "--", ":", "-."), strict=False):
                     line = [(s.angle, getattr(s.scores, column)) for s in scores if s.row == row]
-                    label = f"{column}, {row}" if len(rows) > 1 else column
+                    name = "LPIPS" if column == "lpips" else "RMSE" if column == "rendering" else column
+                    label = f"{name}, {row}" if len(rows) > 1 else name
                     axes.plot(*zip(*line, strict=True), style, color=color, linewidth=1.2, label=label)
             _finish(axes)
         left.set_ylabel("RMSE of maps", fontsize=FONT)
-        right.set_ylabel("renderings: RMSE, LPIPS", fontsize=FONT)
+        right.set_ylabel("renderings: RMSE and LPIPS", fontsize=FONT)
     return figure
 
 
@@ -155,3 +157,5 @@ def _finish(axes: Axes) -> None:
     axes.legend(fontsize=SMALL, frameon=False)
     for side in ("top", "right"):
         axes.spines[side].set_visible(False)
+    for side in ("bottom", "left"):
+        axes.spines[side].set_color(FAINT)

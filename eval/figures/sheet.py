@@ -5,7 +5,7 @@ Sizes are in points and inches of a page that is as wide as a paper's two column
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -13,8 +13,9 @@ import matplotlib.style
 import numpy as np
 from jaxtyping import Float
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.backends.backend_agg import FigureCanvasAgg, RendererAgg
 from matplotlib.figure import Figure
+from matplotlib.font_manager import FontProperties
 from torch import Tensor
 
 from nets.color import linear_to_srgb
@@ -28,11 +29,11 @@ LARGEST_PICTURE = 1.25
 """Inches of a side: a sheet of few columns is narrower than the page."""
 
 DPI = 200
-FONT, SMALL = 7.0, 5.5
-"""Points of heads and of the lines below pictures; print begins to be unreadable at 5."""
+FONT, SMALL, SMALLEST = 7.0, 5.5, 5.0
+"""Points of heads, of the lines below pictures, and of print that can still be read."""
 
-LABEL, HEAD, LINE, SPACE = 0.16, 0.17, 0.12, 0.03
-"""Inches: of the rows' labels, of the heads, of the line below a picture, between pictures."""
+LABEL, HEAD, LINE, SPACE, GAP = 0.16, 0.12, 0.12, 0.03, 0.1
+"""Inches: of rows' labels, of a line of the heads and below pictures, between pictures and between groups."""
 
 INK, FAINT, NOTHING = "#202020", "#606060", "#ececec"
 
@@ -52,10 +53,24 @@ class Picture:
 
 @dataclass(frozen=True)
 class Line:
-    """A row of pictures and what it is called."""
+    """A row of pictures.
+
+    Attributes:
+        label: what it is called.
+        pictures: as many as there are heads.
+        begins: whether a group of rows begins here.
+    """
 
     label: str
     pictures: tuple[Picture, ...]
+    begins: bool = False
+
+    @property
+    def below(self) -> float:
+        """Inches between its pictures and what follows: a line of text, where any picture has one."""
+        return (
+            LINE if any(picture.image is not None and picture.below for picture in self.pictures) else SPACE
+        )
 
 
 @dataclass(frozen=True)
@@ -86,30 +101,69 @@ def map_picture(material: SVBRDF, name: str) -> Float[Tensor, "1 channels h w"]:
 
 def draw(sheet: Sheet) -> Figure:
     """Return the sheet as a figure."""
-    columns, rows = len(sheet.heads), len(sheet.lines)
+    columns = len(sheet.heads)
     side = min(LARGEST_PICTURE, (PAGE_WIDTH - LABEL - SPACE * (columns - 1)) / columns)
     width = LABEL + columns * side + SPACE * (columns - 1)
-    height = HEAD + rows * (side + LINE)
+    heads = [fit(head, side, FONT, broken=True) for head in sheet.heads]
+    head_height = HEAD * max(1 + text.count("\n") for text, _ in heads) + SPACE
+    tops = [head_height]
+    for line, following in zip(sheet.lines, [*sheet.lines[1:], None], strict=True):
+        gap = GAP if following is not None and following.begins else 0.0
+        tops.append(tops[-1] + side + line.below + gap)
+    height = tops[-1]
     figure = Figure(figsize=(width, height), dpi=DPI, facecolor="white")
 
     def place(left: float, top: float) -> tuple[float, float]:
         return left / width, 1.0 - top / height
 
     for row, line in enumerate(sheet.lines):
-        top = HEAD + row * (side + LINE)
+        top = tops[row]
         x, y = place(LABEL * 0.4, top + side / 2)
-        figure.text(x, y, line.label, fontsize=FONT, color=INK, rotation=90, ha="center", va="center")
+        label, size = fit(line.label, side, FONT)
+        figure.text(x, y, label, fontsize=size, color=INK, rotation=90, ha="center", va="center")
         for column, picture in enumerate(line.pictures):
             left = LABEL + column * (side + SPACE)
             if row == 0:
-                x, y = place(left + side / 2, HEAD * 0.7)
-                figure.text(x, y, sheet.heads[column], fontsize=FONT, color=INK, ha="center", va="baseline")
+                head, size = heads[column]
+                x, y = place(left + side / 2, head_height - SPACE - HEAD * 0.25)
+                figure.text(x, y, head, fontsize=size, color=INK, ha="center", va="baseline", linespacing=1.1)
             x, y = place(left, top + side)
             _show(figure.add_axes((x, y, side / width, side / height)), picture)
             if picture.image is not None:
                 x, y = place(left + side / 2, top + side + LINE * 0.72)
-                figure.text(x, y, picture.below, fontsize=SMALL, color=FAINT, ha="center", va="baseline")
+                below, size = fit(picture.below, side, SMALL)
+                figure.text(x, y, below, fontsize=size, color=FAINT, ha="center", va="baseline")
     return figure
+
+
+def fit(text: str, width: float, size: float, *, broken: bool = False) -> tuple[str, float]:
+    """Return a text as it fits above or below a picture, and the size of its letters.
+
+    Letters become smaller while they can still be read, then the end of the text is left out.
+
+    Args:
+        text: one line.
+        width: inches.
+        size: points it should have.
+        broken: let it go on in a new line after its first space, if it has to.
+    """
+    if broken and _inches(text, size) > width and " " in text:
+        parts = [fit(part, width, size) for part in text.split(" ", 1)]
+        return "\n".join(part for part, _ in parts), min(points for _, points in parts)
+    while size > SMALLEST and _inches(text, size) > width:
+        size = max(SMALLEST, size - 0.1)
+    if _inches(text, size) <= width:
+        return text, size
+    kept = len(text) - 1
+    while kept > 1 and _inches(f"{text[:kept]}…", size) > width:
+        kept -= 1
+    return f"{text[:kept]}…", size
+
+
+def _inches(text: str, size: float) -> float:
+    """Return the width of a text whose letters stand on whole pixels, which makes it wider than in print."""
+    width, _, _ = RendererAgg(1, 1, DPI).get_text_width_height_descent(text, FontProperties(size=size), False)
+    return float(width) / DPI
 
 
 def require_format(kind: str) -> None:
@@ -136,13 +190,23 @@ def write(figure: Figure, path: Path) -> None:
         figure.savefig(temporary, format=kind, dpi=DPI, metadata=undated.get(kind))
 
 
-def grid(heads: Sequence[str], lines: Sequence[tuple[str, Sequence[Picture]]]) -> Sheet:
+def grid(
+    heads: Sequence[str], lines: Sequence[tuple[str, Sequence[Picture]]], begins: Collection[int] = ()
+) -> Sheet:
     """Return a sheet of plain sequences.
+
+    Args:
+        heads: of the columns.
+        lines: labels and pictures.
+        begins: numbers of the lines at which a group begins, with a gap above.
 
     Raises:
         ValueError: a row that has not one picture per head.
     """
-    made = tuple(Line(label, tuple(pictures)) for label, pictures in lines)
+    made = tuple(
+        Line(label, tuple(pictures), begins=number in begins)
+        for number, (label, pictures) in enumerate(lines)
+    )
     for line in made:
         if len(line.pictures) != len(heads):
             raise ValueError(f"row {line.label!r} has {len(line.pictures)} pictures for {len(heads)} columns")

@@ -5,22 +5,38 @@ from __future__ import annotations
 import json
 import math
 from dataclasses import replace
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
 import OpenImageIO as oiio
 import pytest
 import torch
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from matplotlib.transforms import Bbox
 from typer.testing import CliRunner
 
 from eval.cli import main
 from eval.console import BAD_USAGE, INCOMPLETE
 from eval.datasets import Protocol
 from eval.figures.answers import Answers
-from eval.figures.catalogue import FIGURES
+from eval.figures.catalogue import FIGURES, Studio
 from eval.figures.comparisons import maps, renderings, worst
 from eval.figures.light_position import ANGLES, found_lights, light_at, score_angles
-from eval.figures.sheet import DPI, PAGE_WIDTH, Picture, draw, grid, map_picture, write
+from eval.figures.sheet import (
+    DPI,
+    FONT,
+    GAP,
+    PAGE_WIDTH,
+    SMALLEST,
+    Picture,
+    draw,
+    fit,
+    grid,
+    map_picture,
+    write,
+)
 from eval.methods import choose, find_weights
 from eval.metrics import map_rmse
 from eval.yardsticks import Synthetic
@@ -107,7 +123,7 @@ def test_a_light_that_is_found_leaves_no_difference(answers: Answers, monkeypatc
         light_position, "initialize", lambda model, photo: (None, PointLight.at(tuple(where.tolist())))
     )
     (line,) = found_lights(answers, [0], "Ours_hyb").lines
-    assert line.pictures[0].below == "0.0° off, distance 0 % off"
+    assert line.pictures[1].below == "0.0° off, distance 0 % off"
     assert line.pictures[2].below == "RMSE 0.000"
     assert float(line.pictures[2].image.max()) < 1e-3
 
@@ -136,6 +152,60 @@ def test_sheets_fit_a_page_and_gaps_are_seen(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="cannot be written as 'soup'"):
         write(draw(sheet), tmp_path / "sheet.soup")
     assert not np.array_equal(pixels[5], pixels[40])
+
+
+def drawn_texts(figure: Figure) -> dict[str, Bbox]:
+    """Return where a figure's texts are, as shares of its width and height."""
+    renderer = FigureCanvasAgg(figure).get_renderer()
+    to_shares = figure.transFigure.inverted()
+    return {text.get_text(): text.get_window_extent(renderer).transformed(to_shares) for text in figure.texts}
+
+
+def test_long_texts_stay_above_below_and_beside_their_pictures() -> None:
+    image = torch.zeros(1, 3, 8, 8)
+    heads = [f"Ours_hyb_{number} default" for number in range(9)]
+    below = [f"{number}_mosaic_tile_of_{number}" for number in range(9)]
+    pictures = [Picture(image, text) for text in below]
+    found = drawn_texts(draw(grid(heads, [("a_name_that_is_far_too_long", pictures)])))
+    assert len(found) == 19
+    for text, box in found.items():
+        assert 0.0 <= box.x0 < box.x1 <= 1.0, text
+        assert 0.0 <= box.y0 < box.y1 <= 1.0, text
+    for part in ("_hyb", "_mosaic"):
+        boxes = [box for text, box in found.items() if part in text]
+        assert len(boxes) == 9
+        for first, second in pairwise(sorted(boxes, key=lambda box: box.x0)):
+            assert first.x1 < second.x0
+
+
+def test_texts_are_broken_then_made_smaller_then_cut() -> None:
+    assert fit("short", 1.0, FONT) == ("short", FONT)
+    assert fit("Ours_hyb default", 0.7, FONT, broken=True) == ("Ours_hyb\ndefault", FONT)
+    text, size = fit("a_wide_name", 0.5, FONT)
+    assert text == "a_wide_name"
+    assert SMALLEST <= size < FONT
+    text, size = fit("a_name_that_is_far_too_wide", 0.5, FONT)
+    assert text.startswith("a_name")
+    assert text.endswith("…")
+    assert size == SMALLEST
+    assert fit("", 0.5, FONT) == ("", FONT)
+
+
+def test_groups_are_set_apart() -> None:
+    lines = [("a", [Picture(torch.zeros(1, 3, 8, 8))])] * 4
+    together, apart = draw(grid(["x"], lines)), draw(grid(["x"], lines, begins=(0, 2)))
+    assert apart.get_figheight() - together.get_figheight() == pytest.approx(GAP)
+    tops = [axes.get_position().y0 * apart.get_figheight() for axes in apart.axes]
+    first, second, third = (above - below for above, below in pairwise(tops))
+    assert first == pytest.approx(third)
+    assert second == pytest.approx(first + GAP)
+
+
+def test_rows_are_compared_in_the_order_asked_for(run, monkeypatch) -> None:
+    seen = []
+    monkeypatch.setattr("eval.figures_cli.Studio", lambda *given: seen.append(given[2]) or Studio(*given))
+    run("--only", "8", "--rows", "Ours_hyb+,Ours_l1,Ours_hyb+")
+    assert seen == [["Ours_hyb+", "Ours_l1"]]
 
 
 @pytest.fixture
