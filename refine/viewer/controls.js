@@ -336,7 +336,6 @@ function onMove(event) {
 function listen() {
   canvas.addEventListener("pointerdown", (event) => {
     canvas.setPointerCapture(event.pointerId);
-    canvas.focus({preventScroll: true});
     pointers.set(event.pointerId, {at: place(event), pans: event.shiftKey || event.button > 0});
     onMove(event);
   });

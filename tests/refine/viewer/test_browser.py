@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
-import shutil
 import subprocess
 from pathlib import Path
 
-import pytest
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from eval.benchmarks.browser import FLAGS as WEBGL_FLAGS
 from nets.color import linear_to_srgb
 from nets.render import Camera, PointLight, render
 from refine.files import decode_image
@@ -19,26 +16,23 @@ from refine.maps import read_maps
 from refine.viewer import build_page
 
 from .conftest import HEIGHT, WIDTH, WriteResult
+from .devtools import BROWSER, FLAGS, needs_browser
 
-BROWSERS = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
-BROWSER = next(filter(None, map(shutil.which, BROWSERS)), None)
-FLAGS = (
-    *WEBGL_FLAGS,
-    "--force-device-scale-factor=1",
-    "--force-color-profile=srgb",
-    "--hide-scrollbars",
-    "--window-size=600,600",
-    "--virtual-time-budget=10000",
-)
-
-pytestmark = pytest.mark.skipif(BROWSER is None, reason=f"none of {', '.join(BROWSERS)} is installed")
+pytestmark = needs_browser
 
 
 def visit(page: Path, fragment: str, *flags: str) -> str:
     """Open a page and return what Chromium prints."""
     assert BROWSER is not None
     profile = page.parent / "profile"
-    command = [BROWSER, *FLAGS, f"--user-data-dir={profile}", *flags, f"{page.as_uri()}#{fragment}"]
+    command = [
+        BROWSER,
+        *FLAGS,
+        "--virtual-time-budget=10000",
+        f"--user-data-dir={profile}",
+        *flags,
+        f"{page.as_uri()}#{fragment}",
+    ]
     return subprocess.run(command, capture_output=True, text=True, timeout=180, check=True).stdout
 
 
