@@ -12,6 +12,7 @@ import os
 import signal
 import struct
 import sys
+from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from typing import Any, BinaryIO
 
@@ -95,7 +96,7 @@ def decode(path: str, limits: Limits) -> tuple[dict[str, Any], np.ndarray]:
         nameless = path.lower().endswith(NAMES_OF_NOTHING)
         opened = oiio.ImageInput.open(f"/dev/fd/{file.fileno()}" if nameless else path, wanted)
     if opened is None:
-        reason = _one_line(oiio.geterror())
+        reason = _reason(oiio.geterror)
         raise Refused("size" if " limit" in reason else "format", reason)
     try:
         spec = opened.spec()
@@ -103,7 +104,7 @@ def decode(path: str, limits: Limits) -> tuple[dict[str, Any], np.ndarray]:
         stored = str(spec.format) if str(spec.format) in NATIVE else "float"
         pixels = opened.read_image(0, 0, 0, spec.nchannels, stored)
         if pixels is None or opened.has_error:
-            raise Refused("damage", _one_line(opened.geterror()) or "the pixels could not be decoded")
+            raise Refused("damage", _reason(opened.geterror) or "the pixels could not be decoded")
     finally:
         opened.close()
     header = {
@@ -142,9 +143,12 @@ def _plain(value: Any) -> Any:
     return value if value is None or isinstance(value, str | int | float) else str(value)
 
 
-def _one_line(message: str) -> str:
-    """First line of a library's message, without its trailing full stop."""
-    lines = message.strip().splitlines()
+def _reason(message: Callable[[], str]) -> str:
+    """First line of a message, without its full stop; empty if it quotes from the file what is no text."""
+    try:
+        lines = message().strip().splitlines()
+    except UnicodeDecodeError:
+        return ""
     return lines[0].rstrip(" .") if lines else ""
 
 

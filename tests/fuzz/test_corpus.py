@@ -60,8 +60,13 @@ def test_damaged_files_end_in_a_result_or_a_sentence(corpus: dict[str, bytes], t
 
 @pytest.mark.parametrize("path", KEPT, ids=lambda path: path.name)
 def test_what_once_broke_something_does_no_more(path: Path) -> None:
+    said = {
+        "gif-claims-78-megapixels": "cannot hold",
+        "exr-quotes-what-is-no-text": "the pixels could not be decoded",
+    }
+    assert said[path.name] in read_everything(path)
     start = time.process_time()
-    assert "cannot hold" in read_everything(path)
+    read_everything(path)
     assert time.process_time() - start < 1.0
 
 
