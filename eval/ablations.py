@@ -59,9 +59,16 @@ ABLATIONS: dict[str, Recipe] = {
 }
 """Rows of the table by name."""
 
+UNTOLD: dict[str, Recipe] = {
+    "light not told": RECIPES["default"],
+    "light neither told nor fitted": replace(RECIPES["default"], light_fit=None),
+}
+"""Rows of the whole recipe where the photo's light has to be found, or is what the network says."""
+
 
 def ablation_estimator(refiner: Refiner) -> Estimator:
-    """Return the initialization and what every ablation makes of it, with the photo's light given."""
+    """Return the initialization and what every ablation makes of it; but for `UNTOLD`, the light is given."""
+    finding = {name: Refiner(refiner.model, recipe, camera=refiner.camera) for name, recipe in UNTOLD.items()}
 
     def estimate(scene: Scene) -> dict[str, Estimate]:
         start = refiner.fit(as_photo(scene), light=scene.photo_light, iters=0)
@@ -70,6 +77,9 @@ def ablation_estimator(refiner: Refiner) -> Estimator:
             clock = time.perf_counter()
             svbrdf, _ = run_stages(start.initial, start.capture, recipe, {}, None, refiner.engine)
             found[name] = Estimate(svbrdf.detach(), time.perf_counter() - clock)
+        for name, unaided in finding.items():
+            refined = unaided.fit(as_photo(scene))
+            found[name] = Estimate(refined.svbrdf, sum(refined.seconds.values()))
         return found
 
     return estimate
