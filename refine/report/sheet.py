@@ -6,6 +6,7 @@ It is drawn pixel for pixel at 100 %, without times and dates: the same result g
 from __future__ import annotations
 
 import textwrap
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +24,7 @@ from nets.color import gamma_encode, linear_to_srgb
 from nets.render import PointLight
 from nets.svbrdf import MAPS, SVBRDF
 from refine.bands import render_in_bands
+from refine.capture import Capture
 from refine.fidelity import rerendering_rmse
 from refine.refiner import Refined
 
@@ -33,6 +35,8 @@ SMALLEST_SLOT = (232, 150)
 """Width and height at least reserved for a picture, so that captions and plots stay readable."""
 MARGIN, GAP, HEADER, CAPTION, LINE = 20, 14, 44, 38, 15
 COLUMNS, ROWS = 5, 4
+FURTHER_PHOTOS = 11
+"""Most photos besides the first that have a row, at the bottom."""
 FONT = 9.0
 
 NOVEL_LIGHTS = ((-0.7, 0.7), (0.7, 0.7), (0.7, -0.7), (-0.7, -0.7))
@@ -61,27 +65,11 @@ def write_sheet(path: Path | str, refined: Refined, *, uncertainty: bool = False
 def draw_sheet(refined: Refined, *, uncertainty: bool = False) -> Figure:
     """Return the sheet as a figure of `DPI` dots per inch; arguments as `write_sheet`."""
     height, width = refined.svbrdf.size
-    sheet = _Sheet(height, width, ROWS + uncertainty)
-    photo = refined.capture.photo
-    before = render_in_bands(refined.initial, refined.light, refined.camera)
-    after = refined.render()
-    renderings = (("initialization, re-rendered", before), ("refined, re-rendered", after))
+    further = refined.others[:FURTHER_PHOTOS]
+    sheet = _Sheet(height, width, ROWS + uncertainty + len(further))
 
     sheet.title(Path(refined.source).name, _subtitle(refined))
-    light = _point(refined.light)
-    sheet.picture(0, 0, _seen(photo), "photo", f"{width} x {height}, light at {_numbers(light)}", light)
-    for column, (name, rendering) in enumerate(renderings, start=1):
-        error = rerendering_rmse(rendering, refined.capture)
-        sheet.picture(0, column, _seen(rendering), name, f"RMSE {_or_dash(error)}")
-        difference = (gamma_encode(rendering) - gamma_encode(photo)).abs()
-        shown = torch.where(refined.capture.unsaturated, difference * DIFFERENCE_GAIN, 0.0)
-        sheet.picture(
-            0,
-            column + 2,
-            shown,
-            f"|{name.split(',')[0]} - photo| x {DIFFERENCE_GAIN:g}",
-            "saturated pixels left black",
-        )
+    _draw_photo(sheet, 0, "photo", refined, replace(refined.capture, light=refined.light))
     for row, (name, material) in enumerate(
         (("initial", refined.initial), ("refined", refined.svbrdf)), start=1
     ):
@@ -96,14 +84,34 @@ def draw_sheet(refined: Refined, *, uncertainty: bool = False) -> Figure:
     last = ROWS - 1 + uncertainty
     for column, position in enumerate(_novel_positions(height, width)):
         novel = PointLight(
-            torch.tensor([position], device=photo.device), refined.light.intensity, refined.light.falloff
+            refined.light.position.new_tensor([position]), refined.light.intensity, refined.light.falloff
         )
         sheet.picture(
             last, column, _seen(refined.render(novel)), "novel light", f"at {_numbers(position)}", position
         )
+    for number, capture in enumerate(further, start=2):
+        _draw_photo(sheet, last + number - 1, f"photo {number}", refined, capture)
     _draw_losses(sheet.plot(1, 2), refined.losses)
     sheet.text(last, _facts(refined))
     return sheet.figure
+
+
+def _draw_photo(sheet: _Sheet, row: int, name: str, refined: Refined, capture: Capture) -> None:
+    # A photo, what both materials look like under its light, and how far that is from it.
+    assert capture.light is not None
+    photo, light = capture.photo, _point(capture.light)
+    height, width = photo.shape[-2:]
+    sheet.picture(row, 0, _seen(photo), name, f"{width} x {height}, light at {_numbers(light)}", light)
+    for column, (kind, material) in enumerate(
+        (("initialization", refined.initial), ("refined", refined.svbrdf)), start=1
+    ):
+        rendering = render_in_bands(material, capture.light, refined.camera)
+        error = rerendering_rmse(rendering, capture)
+        sheet.picture(row, column, _seen(rendering), f"{kind}, re-rendered", f"RMSE {_or_dash(error)}")
+        difference = (gamma_encode(rendering) - gamma_encode(photo)).abs()
+        shown = torch.where(capture.unsaturated, difference * DIFFERENCE_GAIN, 0.0)
+        caption = f"|{kind} - {name}| x {DIFFERENCE_GAIN:g}"
+        sheet.picture(row, column + 2, shown, caption, "saturated pixels left black")
 
 
 class _Sheet:

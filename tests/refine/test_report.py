@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -46,6 +47,35 @@ def test_pictures_are_drawn_pixel_for_pixel(height: int, width: int, tmp_path: P
     found = read(tmp_path / "report.png")[top : top + height, left : left + width, :3]
     expected = (linear_to_srgb(result.render().clamp(0.0, 1.0))[0].permute(1, 2, 0) * 255.0).round().numpy()
     assert np.abs(found.astype(float) - expected).max() <= 1.0
+
+
+def test_every_photo_of_a_surface_has_a_row_under_its_own_light(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(sheet, "FURTHER_PHOTOS", 2)
+    result = refined(160, 256)
+    other = torch.rand(1, 3, 160, 256, generator=seeded(2))
+    lights = [PointLight.at((x, 0.0, 2.0)) for x in (0.8, -0.8, 0.3)]
+    result = replace(
+        result,
+        others=tuple(
+            replace(result.capture, photo=other * (1 - k / 9), light=light) for k, light in enumerate(lights)
+        ),
+    )
+    write_sheet(tmp_path / "report.png", result)
+    whole = read(tmp_path / "report.png")
+    step = 160 + sheet.CAPTION + sheet.GAP
+    first = sheet.MARGIN + sheet.HEADER + sheet.ROWS * step
+    assert whole.shape[0] == first + 2 * step - sheet.GAP + sheet.MARGIN  # two rows, for two were asked for
+    for row, capture in enumerate(result.others[:2]):
+        top = first + row * step
+        pictures = capture.photo, result.render(capture.light)
+        for column, linear in zip((0, 2), pictures, strict=True):
+            left = sheet.MARGIN + column * (256 + sheet.GAP)
+            found = whole[top : top + 160, left : left + 256, :3].astype(float)
+            expected = (linear_to_srgb(linear.clamp(0.0, 1.0))[0].permute(1, 2, 0) * 255.0).round().numpy()
+            agree = np.abs(found - expected).max(axis=-1) <= 1.0
+            assert agree.mean() > (0.98 if column == 0 else 0.9999)  # a ring marks the light in the photo
 
 
 def test_the_same_result_gives_the_same_bytes(tmp_path: Path) -> None:
