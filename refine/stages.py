@@ -114,7 +114,7 @@ class PosteriorStage:
     """
 
     iterations: int = 6
-    widths: Widths = Widths(normal=0.12, diffuse=0.2, roughness=0.03, specular=0.14)
+    widths: Widths = Widths(normal=0.12, diffuse=0.2, roughness=0.1, specular=0.14)
     noise: float = 0.03
     huber: float = 3.0
 
