@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from scipy import fft, ndimage
 
 Field = NDArray[np.float32]  # [H, W], what is returned
-Real = NDArray[np.floating[Any]]  # what is accepted: any precision
+Real = NDArray[np.floating]  # what is accepted: any precision
 Index = NDArray[np.intp]  # [H, W], which cell or block a pixel belongs to
 
 
