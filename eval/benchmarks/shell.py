@@ -10,11 +10,9 @@ from __future__ import annotations
 
 import argparse
 import json
-import os
 import subprocess
 import sys
 import tempfile
-import time
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -22,6 +20,7 @@ from statistics import median
 
 import OpenImageIO as oiio
 
+from eval.benchmarks.startup import run_python
 from eval.report import markdown_table, number, origin, provenance
 from refine.errors import UserError
 
@@ -63,17 +62,13 @@ def run(photo: Path, recipe: str, size: int, options: Sequence[str] = ()) -> Run
         UserError: the command failed.
     """
     with tempfile.TemporaryDirectory(prefix="refine-") as folder:
-        command = [sys.executable, "-m", "refine.cli", str(photo), "--out", folder, "--recipe", recipe]
-        command += ["--resolution", str(size), "--quiet", *options]
-        clock = time.perf_counter()
-        with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as process:
-            assert process.stderr is not None
-            said = process.stderr.read()
-            _, status, usage = os.wait4(process.pid, 0)
-            seconds = time.perf_counter() - clock
-            process.returncode = os.waitstatus_to_exitcode(status)
-        if process.returncode != 0:
-            raise UserError(f"The run of {size} px cannot be timed: {said.strip()}")
+        command = ["-m", "refine.cli", str(photo), "--out", folder, "--recipe", recipe]
+        try:
+            seconds, usage = run_python(
+                [*command, "--resolution", str(size), "--quiet", *options], subprocess.PIPE
+            )
+        except subprocess.CalledProcessError as error:
+            raise UserError(f"The run of {size} px cannot be timed: {error.stderr.strip()}") from error
         record = json.loads((Path(folder) / f"{photo.stem}.json").read_text(encoding="utf-8"))
     stages = [value for name, value in record["seconds"].items() if name not in NOT_REFINEMENT]
     return Run(recipe, size, seconds, sum(stages), usage.ru_maxrss / 1024)

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import argparse
 import os
+import resource
 import subprocess
 import sys
 import time
@@ -32,19 +33,35 @@ Seconds = tuple[float, float]
 """Elapsed and of the processor."""
 
 
+def run_python(arguments: Sequence[str], stderr: int | None = None) -> tuple[float, resource.struct_rusage]:
+    """Run Python once to its end; return the seconds it took and what it used.
+
+    Args:
+        arguments: of Python.
+        stderr: `subprocess.PIPE` keeps what it says for the error.
+
+    Raises:
+        subprocess.CalledProcessError: it failed.
+    """
+    began = time.perf_counter()
+    command = [sys.executable, *arguments]
+    with subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=stderr, text=True) as process:
+        said = process.stderr.read() if process.stderr else None
+        _, status, usage = os.wait4(process.pid, 0)
+        elapsed = time.perf_counter() - began
+        process.returncode = os.waitstatus_to_exitcode(status)
+    if process.returncode:
+        raise subprocess.CalledProcessError(process.returncode, process.args, stderr=said)
+    return elapsed, usage
+
+
 def start(arguments: Sequence[str]) -> Seconds:
     """Run Python once to its end.
 
     Raises:
         subprocess.CalledProcessError: it failed.
     """
-    began = time.perf_counter()
-    with subprocess.Popen([sys.executable, *arguments], stdout=subprocess.DEVNULL) as process:
-        _, status, usage = os.wait4(process.pid, 0)
-        elapsed = time.perf_counter() - began
-        process.returncode = os.waitstatus_to_exitcode(status)
-    if process.returncode:
-        raise subprocess.CalledProcessError(process.returncode, process.args)
+    elapsed, usage = run_python(arguments)
     return elapsed, usage.ru_utime + usage.ru_stime
 
 
