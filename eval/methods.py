@@ -18,6 +18,7 @@ from nets.checkpoint import CheckpointError, load_model, resolve
 from nets.ensemble import FlipAverage, Predictor
 from nets.render import Camera
 from refine.latent import require_weights
+from refine.memory import StageMemory
 from refine.refiner import Refiner
 from refine.stages import LARGEST_SPEEDUP, LatentStage, Recipe, Stage, find_recipe
 
@@ -67,11 +68,14 @@ class Row:
         """Whether the recipe is not the method's own, but a quick one."""
         return self.recipe is not None and self.recipe != find_recipe(self.recipe.name)
 
-    def refiner(self, camera: Camera, size: int, seed: int, *, flips: bool) -> Refiner:
+    def refiner(
+        self, camera: Camera, size: int, seed: int, *, flips: bool, memory: StageMemory | None = None
+    ) -> Refiner:
         """Load the weights; the recipe is the paper's where the row has none, and is not run there."""
         network = self.method.load(self.weights)
         model = FlipAverage(network) if flips else network
-        return Refiner(model, self.recipe or "paper", camera=camera, resolution=size, seed=seed)
+        recipe = self.recipe or "paper"
+        return Refiner(model, recipe, camera=camera, resolution=size, seed=seed, memory=memory)
 
     def sources(self) -> str:
         """Return names and digests of the files its answers come from, for a caption."""

@@ -16,7 +16,9 @@ from eval.report import provenance
 from eval.yardsticks import Yardstick
 from losses.perceptual import LPIPS
 from nets.data.images import DataError
+from refine.memory import StageMemory
 from refine.refiner import Refiner
+from refine.stages import LatentStage
 
 
 @dataclass
@@ -49,12 +51,15 @@ class Failure:
 
 
 class Bench:
-    """Rows and scenes at hand: each network is loaded once, each scene kept while it is used."""
+    """Rows and scenes at hand: each network is loaded once, each scene kept while it is used.
+
+    Rows that begin with the same latent stage share it, if one is asked after the other: `together`.
+    """
 
     def __init__(self, yardstick: Yardstick, rows: Sequence[Row]) -> None:
         """Load LPIPS; networks follow when they are used."""
         self.yardstick, self.rows = yardstick, {row.method.name: row for row in rows}
-        self.lpips = LPIPS()
+        self.lpips, self._memory = LPIPS(), StageMemory()
         self._refiners: dict[str, Refiner] = {}
         self._scene: tuple[int, Any] | None = None
 
@@ -68,7 +73,11 @@ class Bench:
             return Failure(str(error), of_scene=True)
         if trial.row not in self._refiners:
             self._refiners[trial.row] = row.refiner(
-                yardstick.camera, yardstick.size, yardstick.seed, flips=yardstick.flips
+                yardstick.camera,
+                yardstick.size,
+                yardstick.seed,
+                flips=yardstick.flips,
+                memory=self._memory,
             )
         refiner, refine = self._refiners[trial.row], row.method.recipe is not None
         try:
@@ -135,17 +144,31 @@ def _attempts(
 ) -> Iterator[tuple[Trial, dict[str, Any] | Failure]]:
     if not trials:
         return
+    parts = together(rows, trials)
     if workers == 1:
         bench = Bench(yardstick, rows)
-        yield from ((trial, bench.attempt(trial)) for trial in trials)
+        yield from ((trial, bench.attempt(trial)) for part in parts for trial in part)
         return
     # Spawned: forks of a process whose libraries have threads may hang.
     with ProcessPoolExecutor(workers, get_context("spawn"), _open, (yardstick, rows)) as pool:
         try:
-            pending = {pool.submit(_attempt, trial): trial for trial in trials}
-            yield from ((pending[done], done.result()) for done in as_completed(pending))
+            pending = {pool.submit(_attempt, part): part for part in parts}
+            for done in as_completed(pending):
+                yield from zip(pending[done], done.result(), strict=True)
         finally:
             pool.shutdown(cancel_futures=True)
+
+
+def together(rows: Sequence[Row], trials: Sequence[Trial]) -> list[list[Trial]]:
+    """Part trials: those of one scene whose rows begin with the same network and latent stage go together."""
+    parts: dict[tuple[Any, ...], list[Trial]] = {}
+    known = {row.method.name: row for row in rows}
+    for trial in trials:
+        row = known[trial.row]
+        first = row.recipe.stages[0] if row.recipe else None
+        begins = (row.digest, first) if isinstance(first, LatentStage) else trial.row
+        parts.setdefault((trial.index, begins), []).append(trial)
+    return list(parts.values())
 
 
 _bench: Bench | None = None
@@ -157,6 +180,6 @@ def _open(yardstick: Yardstick, rows: Sequence[Row]) -> None:
     _bench = Bench(yardstick, rows)
 
 
-def _attempt(trial: Trial) -> dict[str, Any] | Failure:
+def _attempt(part: Sequence[Trial]) -> list[dict[str, Any] | Failure]:
     assert _bench is not None
-    return _bench.attempt(trial)
+    return [_bench.attempt(trial) for trial in part]

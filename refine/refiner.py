@@ -29,6 +29,7 @@ from refine.initialization import Predict, Predictor, initialize
 from refine.latent import require_weights
 from refine.light import FalloffChoice, check_falloff, fit_light, fit_light_and_falloff
 from refine.maps import MapFormat, NormalConvention, write_maps
+from refine.memory import StageMemory
 from refine.photo import ColorSpaceChoice, Photo, as_photo, resize_photo
 from refine.run import Report, StagesStopped, run_stages
 from refine.several import complete, find_lights, initialize_together
@@ -146,6 +147,7 @@ class Refiner:
         seed: int = 0,
         device: str | torch.device = "cpu",
         engine: str | None = None,
+        memory: StageMemory | None = None,
     ) -> None:
         """Set up.
 
@@ -160,6 +162,8 @@ class Refiner:
             seed: of everything random, for models or recipes that draw numbers.
             device: where to compute.
             engine: a name in `refine.engine.ENGINES`; None takes the fastest for the device.
+            memory: shared with other refiners of the same photos, lets them continue where a latent stage of
+                this one ended (`refine.memory`).
 
         Raises:
             nets.checkpoint.CheckpointError: if a named checkpoint, or the auto-encoder of a recipe, cannot be
@@ -179,6 +183,7 @@ class Refiner:
         self.camera_of_several = camera or Camera("collocated")
         self.resolution = resolution
         self.seed = seed
+        self.memory = memory
 
     def fit(
         self,
@@ -314,7 +319,9 @@ class Refiner:
         """Run the stages on photos whose lights are known, and put everything that is known together."""
         stopped = False
         try:
-            svbrdf, losses = run_stages(initial, captures, recipe, seconds, progress, self.engine)
+            svbrdf, losses = run_stages(
+                initial, captures, recipe, seconds, progress, self.engine, self.memory
+            )
         except StagesStopped as stop:
             stopped, svbrdf, losses = True, stop.svbrdf, stop.losses
         light = captures[0].light

@@ -12,6 +12,7 @@ from refine.capture import Capture
 from refine.engine import choose_engine, find_descend, find_solve
 from refine.engine.reference import Progress, Stopped
 from refine.latent import descend_latent
+from refine.memory import Outcome, StageMemory
 from refine.parametrization import Parameters
 from refine.stages import LatentStage, PosteriorStage, Recipe, Stage
 
@@ -26,6 +27,7 @@ def run_stages(
     seconds: dict[str, float],
     progress: Report | None = None,
     engine: str | None = None,
+    memory: StageMemory | None = None,
 ) -> tuple[SVBRDF, dict[str, list[float]]]:
     """Run a recipe's stages from an initialization under fixed lights, by an engine of `refine.engine`.
 
@@ -37,6 +39,8 @@ def run_stages(
         seconds: gains one entry per stage.
         progress: called after every iteration.
         engine: a name in `refine.engine.ENGINES`; None takes the fastest for the device.
+        memory: of latent stages, which take a minute where others take a second: one that it knows is not run
+            again, and counts with the seconds it took.
 
     Stages that move no map are passed over.
 
@@ -61,16 +65,22 @@ def run_stages(
     for stage in recipe.stages:
         if not stage.moves:
             continue
-        clock = time.perf_counter()
         count = sum(name.split(" ")[0] == stage.name for name in losses)
         label = f"{stage.name} {count + 1}" if count else stage.name
+        remembers = memory if isinstance(stage, LatentStage) else None
+        asked = (stage, parameters, photos, engine)
+        known = remembers.recall(*asked) if remembers else None
+        clock = time.perf_counter() - (known.seconds if known else 0.0)
 
         def tell(iteration: int, loss: float, name: str = label, before: int = finished) -> None:
             if progress is not None:
                 progress(name, before + iteration, recipe.iterations, loss)
 
         try:
-            parameters, losses[label] = _run_stage(stage, parameters, photos, tell, engine)
+            if known is not None:
+                parameters, losses[label] = known.parameters, list(known.history)
+            else:
+                parameters, losses[label] = _run_stage(stage, parameters, photos, tell, engine)
         except KeyboardInterrupt as interrupt:
             if isinstance(interrupt, Stopped):
                 parameters, losses[label] = interrupt.parameters, interrupt.history
@@ -81,6 +91,8 @@ def run_stages(
             start = math.inf
         finished += stage.iterations
         seconds[label] = time.perf_counter() - clock
+        if remembers is not None and known is None:
+            remembers.keep(*asked, Outcome(parameters, losses[label], seconds[label]))
     return _better(initial, parameters, photos, start), losses
 
 

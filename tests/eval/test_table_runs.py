@@ -18,7 +18,7 @@ from eval.datasets import Protocol, novel_lights, strip_scenes
 from eval.development import as_photo
 from eval.ledger import Ledger
 from eval.methods import choose, find_weights
-from eval.table_runs import Bench, measure
+from eval.table_runs import Bench, Trial, measure, together
 from eval.yardsticks import Real, Synthetic
 from nets.data.strips import write_strip
 from refine.refiner import Refiner
@@ -237,3 +237,17 @@ def test_quick_takes_eight_and_three(run, monkeypatch: pytest.MonkeyPatch, tmp_p
     run("table2", "--quick", "--set", str(tmp_path / "photos"), rows=ROWS[:1])
     run("table2", "--quick", "--scenes", "2", "--set", str(tmp_path / "photos"), rows=ROWS[:1])
     assert [len(trials) for trials in counts] == [8, 3, 2]
+
+
+@pytest.mark.parametrize("names", [("Gao19", "Ours_syn", "Gao19+"), ("Des19", "Gao19", "Ours_syn+")])
+def test_rows_that_begin_with_one_search_are_asked_together(names: tuple[str, ...], tiny: Path) -> None:
+    """Others alone, so that a table is shared out as finely as it can be, and nothing twice."""
+    inits = {"Ours_syn": str(tiny), "Ours_syn+": str(tiny)}
+    rows = find_weights(choose(names), inits)[0]
+    trials = [Trial(row.method.name, index) for index in (4, 7) for row in rows]
+    parts = together(rows, trials)
+    assert sorted(trials, key=str) == sorted((trial for part in parts for trial in part), key=str)
+    latent = [name for name in names if name.startswith("Gao19")]
+    for index in (4, 7):
+        assert [Trial(name, index) for name in latent] in parts
+    assert all(len(part) == 1 for part in parts if not part[0].row.startswith("Gao19"))
