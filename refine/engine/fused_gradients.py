@@ -49,10 +49,10 @@ def gradients(
         sums = np.empty(len(packed))
 
         def evaluate(number: int, part: Packed) -> None:
-            surface = layout.pack_surface(parameters, {}, problem.moves, part.pixels)
-            losses = np.empty((len(surface), 2))
+            layout.restart(part.surface, parameters, part.pixels)
+            losses = np.empty((len(part.surface), 2))
             kernel.descend_blocks(
-                surface,
+                part.surface,
                 part.photos,
                 shared,
                 problem.constants,
@@ -62,7 +62,7 @@ def gradients(
                 part.counts,
                 losses,
             )
-            layout.unpack_offsets(surface, part.pixels, found)
+            layout.unpack_offsets(part.surface, part.pixels, found)
             sums[number] = losses[:, 0].sum()
 
         def work(parts: slice) -> None:

@@ -125,14 +125,19 @@ def pack_surface(
         span: the pixels.
     """
     blocks = _blocks(kernel.SURFACE_ROWS, span, start.normal.dtype)
-    for name in MAPS:
-        rows = ROWS[name]
-        _fill(blocks, kernel.START + rows.start, getattr(start, name), span)
-        if name in offsets:
-            _fill(blocks, kernel.OFFSET + rows.start, offsets[name], span)
+    _fill_start(blocks, start, span)
+    for name, offset in offsets.items():
+        _fill(blocks, kernel.OFFSET + ROWS[name].start, offset, span)
     _fill(blocks, kernel.MOVES, moves, span)
     blocks[:, kernel.OFFSET :] *= blocks[:, kernel.MOVES, None]
     return blocks.reshape(len(blocks), -1)
+
+
+def restart(surface: Float[np.ndarray, "blocks numbers"], start: Parameters, span: Span) -> None:
+    """Put other starting parameters, without offsets, into a packed surface."""
+    blocks = surface.reshape(len(surface), -1, kernel.BLOCK)
+    _fill_start(blocks, start, span)
+    blocks[:, kernel.OFFSET :] = 0.0
 
 
 def pack_photos(
@@ -179,6 +184,11 @@ def _pack_photo(
 
 def _blocks(rows: int, span: Span, dtype: torch.dtype) -> Float[np.ndarray, "blocks rows block"]:
     return aligned_zeros((count_blocks(span), rows, kernel.BLOCK), dtype)
+
+
+def _fill_start(blocks: Float[np.ndarray, "blocks rows block"], start: Parameters, span: Span) -> None:
+    for name in MAPS:
+        _fill(blocks, kernel.START + ROWS[name].start, getattr(start, name), span)
 
 
 def _fill(blocks: Float[np.ndarray, "blocks rows block"], row: int, tensor: Tensor, span: Span) -> None:
