@@ -16,6 +16,7 @@ from eval.report import provenance
 from eval.yardsticks import Yardstick
 from losses.perceptual import LPIPS
 from nets.data.images import DataError
+from nets.processes import end_with_parent
 from refine.memory import StageMemory
 from refine.refiner import Refiner
 from refine.stages import LatentStage
@@ -176,6 +177,7 @@ _bench: Bench | None = None
 
 def _open(yardstick: Yardstick, rows: Sequence[Row]) -> None:
     global _bench
+    end_with_parent()
     torch.set_num_threads(1)
     _bench = Bench(yardstick, rows)
 

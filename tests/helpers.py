@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any, Literal
 
 import torch
@@ -78,3 +79,11 @@ def random_light(
     position = torch.stack([3.0 * x - 1.5, 3.0 * y - 1.5, 0.8 + 2.0 * z], dim=1)
     intensity = 0.5 + torch.rand(batch, 3, generator=generator, dtype=torch.float64)
     return PointLight(position.to(dtype), intensity.to(dtype), falloff)
+
+
+def is_running(pid: int) -> bool:
+    """Whether a process is there and no zombie; looks in /proc."""
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
+    except OSError:
+        return False

@@ -27,6 +27,7 @@ from nets.data.images import DataError, resize, unit_normal
 from nets.data.pbr import read_pbr_folder
 from nets.data.pool_format import Entry, Part, decode, encode, from_planes, licence_of, part_of
 from nets.data.procedural import FAMILIES, HELD_OUT_FAMILIES, generate
+from nets.processes import end_with_parent
 from nets.svbrdf import SVBRDF
 
 __all__ = ["Entry", "MaterialPool", "Part", "build_pool", "decode", "encode", "make", "part_of", "plan"]
@@ -246,7 +247,7 @@ def _make_all(entries: Sequence[Entry], size: int, parts: Path, workers: int) ->
     if workers == 0:
         yield from map(_make_part, *arguments)
         return
-    with ProcessPoolExecutor(workers, mp_context=get_context("spawn"), initializer=_one_thread) as executor:
+    with ProcessPoolExecutor(workers, get_context("spawn"), _begin) as executor:
         yield from executor.map(_make_part, *arguments)
 
 
@@ -264,7 +265,8 @@ def _make_part(entry: Entry, size: int, parts: Path, number: int) -> bool:
     return True
 
 
-def _one_thread() -> None:
+def _begin() -> None:
+    end_with_parent()
     torch.set_num_threads(1)
 
 

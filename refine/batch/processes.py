@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import contextlib
 import multiprocessing
-import os
 import signal
 import threading
 from collections import Counter, deque
@@ -17,6 +16,8 @@ from contextlib import contextmanager
 from multiprocessing import resource_tracker
 from multiprocessing.connection import Connection, wait
 from typing import Generic, TypeVar
+
+from nets.processes import end_with_parent
 
 J = TypeVar("J", bound=Hashable)
 
@@ -130,18 +131,11 @@ class _Worker(Generic[J]):
 def _serve(connection: Connection, opening: Callable[[], Work[J]]) -> None:
     """Answer jobs until the pipe is closed: the whole life of a process."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # it was held back until here
-    threading.Thread(target=_end_with_parent, daemon=True).start()
+    end_with_parent()
     work = opening()
     with contextlib.suppress(EOFError):
         while True:
             connection.send(work(connection.recv()))
-
-
-def _end_with_parent() -> None:
-    parent = multiprocessing.parent_process()
-    assert parent is not None
-    parent.join()
-    os._exit(1)
 
 
 @contextmanager

@@ -13,6 +13,7 @@ from pathlib import Path
 import pytest
 
 from refine.batch.processes import interrupts_held, work_in_processes
+from tests.helpers import is_running
 from tests.refine.batch.toys import Toys
 
 PATIENCE = 60.0
@@ -21,13 +22,6 @@ ROOT = Path(__file__).parents[3]
 
 def processes(folder: Path) -> list[int]:
     return [int(path.name.partition("-")[2]) for path in folder.glob("process-*")]
-
-
-def is_running(pid: int) -> bool:
-    try:
-        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
-    except OSError:
-        return False
 
 
 def test_every_job_has_its_outcome(tmp_path: Path) -> None:
