@@ -41,6 +41,7 @@ from refine.photo import Photo
 from refine.refiner import Refined
 from refine.report.sheet import write_sheet
 from refine.report.thumbnail import write_thumbnail
+from refine.stages import LatentStage, Recipe
 
 FORMAT = "svbrdf-refine result 1"
 
@@ -226,6 +227,7 @@ def describe(
         "recipe": refined.recipe.as_dict(),
         "engine": refined.engine,
         "checkpoint": checkpoint,
+        "auto_encoders": describe_auto_encoders(refined.recipe),
         "light": _light(refined.light),
         "camera": asdict(refined.camera),
         "maps": {
@@ -301,6 +303,11 @@ def describe_checkpoint(name: str | Path) -> dict[str, Any]:
     path = resolve(name)
     record = asdict(read_record(name)) if path.suffix == ".safetensors" else None
     return {"name": str(name), "sha256": digest(path), "record": record}
+
+
+def describe_auto_encoders(recipe: Recipe) -> list[dict[str, Any]]:
+    """Return the networks that a recipe needs besides the checkpoint, as above; most recipes need none."""
+    return [describe_checkpoint(s.checkpoint) for s in recipe.stages if isinstance(s, LatentStage)]
 
 
 def versions() -> dict[str, str]:

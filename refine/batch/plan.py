@@ -120,7 +120,7 @@ def is_finished(job: Job, request: Request, checkpoint: str) -> bool:
         request: the settings.
         checkpoint: SHA-256 of the network's file.
     """
-    from refine.result import FORMAT, digest
+    from refine.result import FORMAT, describe_auto_encoders, digest
 
     record = read_record(job)
     if record is None or record.get("format") != FORMAT or record.get("interrupted"):
@@ -134,6 +134,8 @@ def is_finished(job: Job, request: Request, checkpoint: str) -> bool:
         return (
             all(record[name] == value for name, value in expected.items())
             and record["checkpoint"]["sha256"] == checkpoint
+            and [network["sha256"] for network in record.get("auto_encoders", [])]
+            == [network["sha256"] for network in describe_auto_encoders(request.steps())]
             and record["maps"]["files"] == {name: path.name for name, path in paths.items()}
             and all(path.is_file() and path.stat().st_size > 0 for path in paths.values())
             and record["photo"]["sha256"] == digest(job.photo)

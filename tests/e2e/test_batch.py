@@ -151,6 +151,10 @@ def another_network(mats: Path) -> None:
     amend(mats, lambda record: record["checkpoint"].update(sha256="0" * 64))
 
 
+def another_auto_encoder(mats: Path) -> None:
+    amend(mats, lambda record: record.update(auto_encoders=[{"sha256": "0" * 64}]))
+
+
 def interrupted(mats: Path) -> None:
     amend(mats, lambda record: record.update(interrupted=True))
 
@@ -173,7 +177,16 @@ def another_record(mats: Path) -> None:
 
 @pytest.mark.parametrize(
     "change",
-    [another_photo, another_network, interrupted, a_map_is_gone, a_map_is_empty, no_record, another_record],
+    [
+        another_photo,
+        another_network,
+        another_auto_encoder,
+        interrupted,
+        a_map_is_gone,
+        a_map_is_empty,
+        no_record,
+        another_record,
+    ],
 )
 def test_what_is_not_finished_is_done(
     change: Callable[[Path], None], copy: Path, arguments: list[str], tried: list[str]

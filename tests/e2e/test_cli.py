@@ -108,6 +108,7 @@ def test_the_json_tells_everything(result: tuple[Path, str, str], photo: Path, c
     assert record["recipe"]["name"] == "default"
     assert record["checkpoint"]["record"]["architecture"] == GeneratorConfig(2, 7, 2).as_dict()
     assert len(record["checkpoint"]["sha256"]) == 64
+    assert record["auto_encoders"] == []
     assert len(record["light"]["position"]) == len(record["light"]["intensity"]) == 3
     assert record["light"]["falloff"] == "none"
     assert record["camera"] == {"kind": "perspective", "position": [0.0, 0.0, 2.14]}

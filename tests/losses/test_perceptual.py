@@ -7,6 +7,7 @@ that they need no file.
 
 import io
 import json
+import os
 import pickle
 from pathlib import Path
 
@@ -21,9 +22,13 @@ from losses.fetch_weights import FEATURES, HEADS, VGG_HEADS, NumpyUnpickler
 from losses.perceptual import INPUT_SCALE, INPUT_SHIFT, LPIPS, LPIPS_ALEX, LPIPS_VGG_HEADS, LPIPSVGG
 from losses.vgg import BLOCKS
 from losses.vgg_weights import VGGWeightsMissing, load_vgg16
+from nets.data.images import read_image, to_tensor
 from tests.helpers import seeded
 
 SHAPE = (96, 128)
+
+IMAGES = "REFINE_LPIPS_IMAGES"
+"""Environment variable: the folder `imgs` of the reference package's repository."""
 
 # kind of the first picture, kind of the second, the reference package's distances with AlexNet and VGG-16
 REFERENCE = [
@@ -67,6 +72,17 @@ def test_agrees_with_the_reference_package(
 ) -> None:
     found = float(distance(picture(first), picture(second)))
     assert found == pytest.approx(expected, abs=0.001)
+
+
+@pytest.mark.skipif(IMAGES not in os.environ, reason=f"{IMAGES} does not name the reference package's imgs/")
+@pytest.mark.parametrize(("other", "expected"), [("ex_p0.png", 0.722), ("ex_p1.png", 0.138)])
+def test_the_reference_package_s_examples_have_the_distances_it_prints(
+    distance: LPIPS, other: str, expected: float
+) -> None:
+    """The pictures are in its repository only, and in no package: for those who have it."""
+    folder = Path(os.environ[IMAGES])
+    a, b = (to_tensor(read_image(folder / name)[0]) * 2.0 - 1.0 for name in ("ex_ref.png", other))
+    assert float(distance(a, b)) == pytest.approx(expected, abs=0.002)
 
 
 @pytest.fixture(scope="module")

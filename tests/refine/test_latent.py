@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import math
 from pathlib import Path
 
@@ -25,6 +26,7 @@ from refine.engine import ENGINES, find_gradients
 from refine.engine.reference import Stopped
 from refine.latent import decode, descend_latent, encode
 from refine.parametrization import Parameters
+from refine.result import describe_auto_encoders
 from refine.run import run_stages
 from refine.stages import GAO_PIXELS, LatentStage, PixelStage, Recipe, find_recipe
 from tests.helpers import assert_close, random_svbrdf, seeded
@@ -244,3 +246,12 @@ def test_missing_weights_are_one_sentence(
     assert said.startswith("refine: gao19: no such checkpoint; ")
     assert said.count("\n") == 1
     assert {path.name for path in tmp_path.iterdir()} == {"start.safetensors", "photo.png"}
+
+
+def test_results_name_the_auto_encoder_they_depend_on(weights: str) -> None:
+    recipe = Recipe("some", stages=(LatentStage(2, checkpoint=weights), PixelStage(2)))
+    (found,) = describe_auto_encoders(recipe)
+    assert found["name"] == weights
+    assert found["sha256"] == hashlib.sha256(Path(weights).read_bytes()).hexdigest()
+    assert found["record"]["architecture"] == TINY.as_dict()
+    assert describe_auto_encoders(find_recipe("default")) == []
