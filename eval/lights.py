@@ -21,6 +21,7 @@ from eval.datasets import SIZE, Protocol, input_photo
 from eval.development import DEVELOPMENT, TestSet, read_scenes, require
 from eval.report import Results, markdown_table, number, origin, skipped_lines
 from nets.data.photography import FlashPhotography
+from nets.render import AUTHORS_CAMERA
 from refine.capture import Capture
 from refine.initialization import initialize
 from refine.light import fit_light
@@ -48,6 +49,7 @@ class LightScore:
         distance: true one from the patch centre, surface units.
         direction_error: angle between true and estimated direction from the patch centre, degrees.
         distance_error: of the estimated distance, as a share of the true one.
+        direction_error_at_height: of the direction, once the true height is put in, see `at_height`.
     """
 
     method: str
@@ -57,13 +59,14 @@ class LightScore:
     distance: float
     direction_error: float
     distance_error: float
+    direction_error_at_height: float
 
 
 class LightResults(Results[LightScore]):
     """What the table is made of."""
 
     def rows(self) -> list[dict[str, Any]]:
-        """Return medians and 90th percentiles of both errors per method and band, then within `WITHIN`."""
+        """Return medians and 90th percentiles of the errors per method and band, then within `WITHIN`."""
         rows = []
         for method in dict.fromkeys(score.method for score in self.scored):
             for low, high in (*BANDS, WITHIN):
@@ -71,7 +74,7 @@ class LightResults(Results[LightScore]):
                 if not found:
                     continue
                 row: dict[str, Any] = {"method": method, "angles": [low, high], "photos": len(found)}
-                for name in ("direction_error", "distance_error"):
+                for name in ("direction_error", "distance_error", "direction_error_at_height"):
                     median, most = np.percentile([getattr(score, name) for score in found], [50, 90])
                     row |= {f"{name}_median": float(median), f"{name}_90": float(most)}
                 rows.append(row)
@@ -140,6 +143,23 @@ def light_errors(estimate: Float[Tensor, "3"], truth: Float[Tensor, "3"]) -> tup
     return math.degrees(float(angle)), abs(float(ratio) - 1.0)
 
 
+def at_height(
+    estimate: Float[Tensor, "3"], height: float, camera_height: float = AUTHORS_CAMERA[2]
+) -> Float[Tensor, "3"]:
+    """Return an estimated light moved to another height, with a mirror's highlight where it was.
+
+    A camera at height c over the centre sees the highlight at `c / (c + z)` of the light's x and y: one
+    highlight, many lights. What is left of an estimate's error at the true height is not about the height.
+
+    Args:
+        estimate: position of the light.
+        height: the z it is moved to.
+        camera_height: the camera's z.
+    """
+    share = (camera_height + height) / (camera_height + float(estimate[2]))
+    return torch.cat([estimate[:2] * share, estimate.new_tensor([height])])
+
+
 def evaluate_lights(
     estimate: LightEstimator,
     data: Path,
@@ -176,7 +196,8 @@ def evaluate_lights(
             where = (math.degrees(math.atan2(math.hypot(x, y), z)), math.hypot(x, y, z))
             for method, position in estimate(photo).items():
                 errors = light_errors(position, truth)
-                results.scored.append(LightScore(method, test_set.name, scene.name, *where, *errors))
+                told = light_errors(at_height(position, z), truth)[0]
+                results.scored.append(LightScore(method, test_set.name, scene.name, *where, *errors, told))
         if progress is not None:
             progress(scene.name)
     return results
@@ -189,7 +210,8 @@ def lights_markdown(results: LightResults) -> str:
         f"Error of the flash's direction from the patch centre, and of its distance as a share of it, on "
         f"{', '.join(settings['sets'])}; {settings['size']} px; each material photographed once in every "
         f"band of angles, cosine-weighted within it, at distances as in training; white light without "
-        f"falloff, photo clamped; checkpoints {', '.join(settings.get('inits', '?'))}"
+        f'falloff, photo clamped; "height told": moved to the true height, mirror image left where it was; '
+        f"checkpoints {', '.join(settings.get('inits', '?'))}"
         f"{', averaged over four flips' if settings.get('flips') else ''}; seed {settings['seed']}; "
         f"{origin(settings)}."
     )
@@ -198,7 +220,8 @@ def lights_markdown(results: LightResults) -> str:
         low, high = row["angles"]
         cells = [number(row[f"direction_error_{part}"], 1) for part in ("median", "90")]
         cells += [number(100.0 * row[f"distance_error_{part}"], 0) for part in ("median", "90")]
+        cells.append(number(row["direction_error_at_height_median"], 1))
         rows.append([row["method"], f"{low:.0f}-{high:.0f}", str(row["photos"]), *cells])
     heads = ["method", "degrees off centre", "photos", "direction, median (degrees)", "90 %"]
-    heads += ["distance, median (%)", "90 %"]
+    heads += ["distance, median (%)", "90 %", "direction, height told"]
     return "\n".join([caption, "", *markdown_table(heads, rows, 2), *skipped_lines(results.skipped)]) + "\n"

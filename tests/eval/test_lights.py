@@ -17,13 +17,14 @@ from eval.lights import (
     BANDS,
     LightResults,
     LightScore,
+    at_height,
     evaluate_lights,
     light_errors,
     light_estimator,
     lights_markdown,
     off_centre,
 )
-from nets.render import PointLight, render
+from nets.render import AUTHORS_CAMERA, PointLight, render
 from nets.svbrdf import SVBRDF
 from refine.refiner import Refiner
 from tests.eval_files import material
@@ -74,10 +75,33 @@ def test_errors(estimate: tuple[float, ...], direction: float, distance: float) 
     assert found == (pytest.approx(direction, abs=1e-5), pytest.approx(distance, abs=1e-6))
 
 
+@pytest.mark.parametrize("height", [1.0, 2.4, 7.0])
+def test_a_light_at_another_height_has_its_mirror_image_at_the_same_place(height: float) -> None:
+    camera = torch.tensor(AUTHORS_CAMERA, dtype=torch.float64)
+    light = torch.tensor([0.6, -0.4, 2.4], dtype=torch.float64)
+    moved = at_height(light, height)
+    assert float(moved[2]) == height
+
+    def bisects(position: Tensor, place: Tensor) -> bool:
+        towards = [torch.nn.functional.normalize(point - place, dim=0) for point in (position, camera)]
+        return bool((sum(towards)[:2].abs() < 1e-12).all())  # half vector upright
+
+    place = torch.cat([light[:2] * camera[2] / (camera[2] + light[2]), light.new_zeros(1)])
+    assert bisects(light, place)
+    assert bisects(moved, place)
+
+
 def test_rows_are_medians_and_ninetieths_by_band_and_within_35_degrees() -> None:
     scored = [
         LightScore(
-            "a", "s", str(number), where, 2.0, direction_error=float(number), distance_error=0.01 * number
+            "a",
+            "s",
+            str(number),
+            where,
+            2.0,
+            direction_error=float(number),
+            distance_error=0.01 * number,
+            direction_error_at_height=0.5 * number,
         )
         for number, where in enumerate([1.0, 5.0, 14.9, 15.0, 30.0, 40.0])
     ]
@@ -92,6 +116,7 @@ def test_rows_are_medians_and_ninetieths_by_band_and_within_35_degrees() -> None
     assert rows[0.0, 35.0]["direction_error_median"] == 2.0
     assert rows[0.0, 35.0]["direction_error_90"] == pytest.approx(3.6)
     assert rows[0.0, 15.0]["distance_error_median"] == pytest.approx(0.01)
+    assert rows[0.0, 35.0]["direction_error_at_height_median"] == pytest.approx(1.0)
 
 
 def test_the_light_fit_starts_from_the_head_and_mends_it() -> None:
@@ -122,6 +147,7 @@ def test_every_material_is_photographed_once_in_every_band(data: Path) -> None:
     assert len(results.scored) == len(seen) == 4 * 8
     # Who always says "above the centre" is wrong by the angle itself.
     assert all(one.direction_error == pytest.approx(one.angle, abs=1e-3) for one in results.scored)
+    assert all(one.direction_error_at_height == pytest.approx(one.angle, abs=1e-3) for one in results.scored)
     assert all(one.distance_error == pytest.approx(abs(2.0 / one.distance - 1.0)) for one in results.scored)
     assert {row["photos"] for row in results.rows()} == {8, 24}
     assert "| centred | 0-35 | 24 |" in lights_markdown(results)
