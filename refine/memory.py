@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 from torch import Tensor
@@ -39,19 +39,19 @@ class StageMemory:
         """Begin with nothing known."""
         self._last: tuple[str, Outcome] | None = None
 
-    def recall(
-        self, stage: Stage, start: Parameters, photos: Sequence[Capture], engine: str
-    ) -> Outcome | None:
-        """Return what this very stage found from this very start, or None if it was not the last."""
-        if self._last is None or self._last[0] != _digest(stage, start, photos, engine):
-            return None
+    def outcome(
+        self,
+        stage: Stage,
+        start: Parameters,
+        photos: Sequence[Capture],
+        engine: str,
+        run: Callable[[], Outcome],
+    ) -> Outcome:
+        """Return what this very stage finds from this very start; it runs unless it was the last that did."""
+        asked = _digest(stage, start, photos, engine)
+        if self._last is None or self._last[0] != asked:
+            self._last = asked, run()
         return self._last[1]
-
-    def keep(
-        self, stage: Stage, start: Parameters, photos: Sequence[Capture], engine: str, found: Outcome
-    ) -> None:
-        """Remember an outcome in place of the last one."""
-        self._last = _digest(stage, start, photos, engine), found
 
 
 def _digest(stage: Stage, start: Parameters, photos: Sequence[Capture], engine: str) -> str:

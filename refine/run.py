@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Sequence
+from functools import partial
 
 from nets.svbrdf import SVBRDF
 from refine.bands import distance_in_bands
@@ -67,32 +68,28 @@ def run_stages(
             continue
         count = sum(name.split(" ")[0] == stage.name for name in losses)
         label = f"{stage.name} {count + 1}" if count else stage.name
-        remembers = memory if isinstance(stage, LatentStage) else None
-        asked = (stage, parameters, photos, engine)
-        known = remembers.recall(*asked) if remembers else None
-        clock = time.perf_counter() - (known.seconds if known else 0.0)
+        clock = time.perf_counter()
 
         def tell(iteration: int, loss: float, name: str = label, before: int = finished) -> None:
             if progress is not None:
                 progress(name, before + iteration, recipe.iterations, loss)
 
+        run = partial(_run_stage, stage, parameters, photos, tell, engine)
         try:
-            if known is not None:
-                parameters, losses[label] = known.parameters, list(known.history)
+            if memory is not None and isinstance(stage, LatentStage):
+                found = memory.outcome(stage, parameters, photos, engine, run)
             else:
-                parameters, losses[label] = _run_stage(stage, parameters, photos, tell, engine)
+                found = run()
         except KeyboardInterrupt as interrupt:
             if isinstance(interrupt, Stopped):
                 parameters, losses[label] = interrupt.parameters, interrupt.history
             seconds[label] = time.perf_counter() - clock
             raise StagesStopped(_better(initial, parameters, photos, start), losses) from None
+        parameters, losses[label], seconds[label] = found.parameters, list(found.history), found.seconds
         if isinstance(stage, LatentStage):
             # It left the initialization for what a decoder can make, which may well explain the photos worse.
             start = math.inf
         finished += stage.iterations
-        seconds[label] = time.perf_counter() - clock
-        if remembers is not None and known is None:
-            remembers.keep(*asked, Outcome(parameters, losses[label], seconds[label]))
     return _better(initial, parameters, photos, start), losses
 
 
@@ -120,6 +117,14 @@ def _distance(svbrdf: SVBRDF, photos: Sequence[Capture]) -> float:
 
 
 def _run_stage(
+    stage: Stage, start: Parameters, photos: Sequence[Capture], tell: Progress, engine: str
+) -> Outcome:
+    clock = time.perf_counter()
+    parameters, history = _descend(stage, start, photos, tell, engine)
+    return Outcome(parameters, history, time.perf_counter() - clock)
+
+
+def _descend(
     stage: Stage, start: Parameters, photos: Sequence[Capture], tell: Progress, engine: str
 ) -> tuple[Parameters, list[float]]:
     if isinstance(stage, PosteriorStage):

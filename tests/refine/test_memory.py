@@ -49,7 +49,7 @@ def test_a_longer_recipe_goes_on_where_a_shorter_one_ended(descents: list[float]
     then: dict[str, float] = {}
     found, losses = run_stages(initial, photo(), LONG, then, memory=memory)
     assert len(descents) == 1
-    assert then["latent"] >= first["latent"]  # it counts as if it had been run
+    assert then["latent"] == first["latent"]  # it counts as if it had been run
     alone, alone_losses = run_stages(initial, photo(), LONG, {})
     assert len(descents) == 2
     assert losses == alone_losses
@@ -104,11 +104,27 @@ def test_what_is_kept_does_not_change_with_what_was_returned(descents: list[floa
 )
 def test_another_question_has_no_answer_yet(changed: Callable[..., tuple]) -> None:
     stage, start, engine = ASKED
-    memory, found = StageMemory(), Outcome(start, [1.0], 2.0)
-    assert memory.recall(stage, start, [photo()], engine) is None
-    memory.keep(stage, start, [photo()], engine, found)
-    assert memory.recall(stage, start, [photo()], engine) is found
-    assert memory.recall(*changed(stage, start, photo(), engine)) is None
+    memory = StageMemory()
+    outcomes = [Outcome(start, [loss], 2.0) for loss in (3.0, 2.0, 1.0)]
+    left = iter(outcomes)
+    same = (stage, start, [photo()], engine)
+    assert memory.outcome(*same, lambda: next(left)) is outcomes[0]
+    assert memory.outcome(*same, lambda: next(left)) is outcomes[0]
+    assert memory.outcome(*changed(stage, start, photo(), engine), lambda: next(left)) is outcomes[1]
+    assert memory.outcome(*same, lambda: next(left)) is outcomes[2]  # only the last one is kept
+
+
+def test_what_was_interrupted_is_not_known() -> None:
+    stage, start, engine = ASKED
+    memory = StageMemory()
+
+    def interrupted() -> Outcome:
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        memory.outcome(stage, start, [photo()], engine, interrupted)
+    whole = Outcome(start, [1.0], 2.0)
+    assert memory.outcome(stage, start, [photo()], engine, lambda: whole) is whole
 
 
 def _moved(start: Parameters) -> Parameters:
