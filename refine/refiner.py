@@ -162,8 +162,7 @@ class Refiner:
             seed: of everything random, for models or recipes that draw numbers.
             device: where to compute.
             engine: a name in `refine.engine.ENGINES`; None takes the fastest for the device.
-            memory: shared with other refiners of the same photos, lets them continue where a latent stage of
-                this one ended (`refine.memory`).
+            memory: of latent stages, shared by refiners of the same photos (`refine.memory`).
 
         Raises:
             nets.checkpoint.CheckpointError: if a named checkpoint, or the auto-encoder of a recipe, cannot be
@@ -233,8 +232,7 @@ class Refiner:
             seconds["light"] = time.perf_counter() - clock
         light = light or guess
         capture = replace(capture, light=light)
-        notes = photo.notes
-        return self._explain(initial, (capture,), self.camera, recipe, seconds, notes, photo.source, progress)
+        return self._explain(initial, (capture,), self.camera, recipe, seconds, photo.notes, progress)
 
     def fit_many(
         self,
@@ -302,8 +300,7 @@ class Refiner:
         lit = [replace(capture, light=light) for capture, light in zip(captures, found, strict=True)]
         lit = [complete(capture, seen, initial) for capture, seen in zip(lit, visible, strict=True)]
         notes = (*photos[0].notes, f"the first of {len(photos)} photos of one surface")
-        camera, source = self.camera_of_several, photos[0].source
-        return self._explain(initial, tuple(lit), camera, recipe, seconds, notes, source, progress)
+        return self._explain(initial, tuple(lit), self.camera_of_several, recipe, seconds, notes, progress)
 
     def _explain(
         self,
@@ -313,21 +310,18 @@ class Refiner:
         recipe: Recipe,
         seconds: dict[str, float],
         notes: tuple[str, ...],
-        source: str,
         progress: Report | None,
     ) -> Refined:
         """Run the stages on photos whose lights are known, and put everything that is known together."""
         stopped = False
         try:
-            svbrdf, losses = run_stages(
-                initial, captures, recipe, seconds, progress, self.engine, self.memory
-            )
+            found, losses = run_stages(initial, captures, recipe, seconds, progress, self.engine, self.memory)
         except StagesStopped as stop:
-            stopped, svbrdf, losses = True, stop.svbrdf, stop.losses
+            stopped, found, losses = True, stop.svbrdf, stop.losses
         light = captures[0].light
         assert light is not None
         refined = Refined(
-            svbrdf.detach(),
+            found.detach(),
             initial,
             light,
             camera,
@@ -336,7 +330,7 @@ class Refiner:
             seconds,
             recipe,
             notes,
-            source,
+            captures[0].source,
             engine=self.engine,
             others=captures[1:],
             interrupted=stopped,
