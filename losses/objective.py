@@ -133,7 +133,8 @@ class SyntheticObjective:
     @property
     def judged(self) -> dict[str, int]:
         """Return the critics this needs: what each judges, and its channels."""
-        return {**CHANNELS, **({"rendering": 3} if self.rendering_weight else {})}
+        rendering = bool(self.rendering_weight) and self.rendering.need_critic
+        return {**(CHANNELS if self.maps.need_critic else {}), **({"rendering": 3} if rendering else {})}
 
     def as_dict(self) -> dict[str, Any]:
         """Return plain data for a checkpoint's header."""
@@ -153,9 +154,7 @@ class SyntheticObjective:
         for name in MAPS:
             factor = self.normal_factor if name == "normal" else 1.0
             score.measure(name, parts[name] - truths[name], self.maps, factor)
-            score.judge(
-                name, critics[name], seen(condition), seen(parts[name]), seen(truths[name]), self.maps
-            )
+            score.judge(name, critics, seen(condition), seen(parts[name]), seen(truths[name]), self.maps)
         if self.rendering_weight:
             self._add_renderings(score, critics, estimate, batch, condition, seen, generator)
         return score.losses()
@@ -183,7 +182,7 @@ class SyntheticObjective:
         shown, real = gamma_encode(rendering), gamma_encode(reference)
         score.judge(
             "rendering",
-            critics["rendering"],
+            critics,
             seen(condition),
             2.0 * seen(shown) - 1.0,
             2.0 * seen(real) - 1.0,
@@ -230,7 +229,7 @@ class RealObjective:
     @property
     def judged(self) -> dict[str, int]:
         """Return the critic this needs, and its channels."""
-        return {"real": 3}
+        return {"real": 3} if self.rendering.need_critic else {}
 
     def as_dict(self) -> dict[str, Any]:
         """Return plain data for a checkpoint's header."""
@@ -258,7 +257,7 @@ class RealObjective:
         score = Score()
         score.measure("real", encoded_difference(rendering, reference), self.rendering)
         score.judge(
-            "real", critics["real"], seen(condition), 2 * seen(shown) - 1, 2 * seen(truth) - 1, self.rendering
+            "real", critics, seen(condition), 2 * seen(shown) - 1, 2 * seen(truth) - 1, self.rendering
         )
         score.perceive("real", self.perceptual, seen(shown), seen(truth), self.rendering)
         return score.losses()
@@ -297,12 +296,11 @@ class HybridObjective:
         """Return both players' losses and their parts on one batch of both kinds."""
         synthetic = self.synthetic(network, critics, batch, generator)
         real = self.real(network, critics, batch, generator)
-        assert synthetic.critics is not None
-        assert real.critics is not None
+        told = [part.critics for part in (synthetic, real) if part.critics is not None]
         return Losses(
             synthetic.generator + self.real_weight * real.generator,
             {**synthetic.terms, **real.terms},
-            synthetic.critics + real.critics,
+            torch.stack(told).sum() if told else None,
         )
 
 

@@ -39,6 +39,11 @@ class TermWeights:
     perceptual: float = 0.0
     l2: float = 0.0
 
+    @property
+    def need_critic(self) -> bool:
+        """Whether any weighed term comes from a critic."""
+        return bool(self.adversarial or self.feature)
+
 
 class Score:
     """Adds up what both players are told, and keeps the parts."""
@@ -63,7 +68,7 @@ class Score:
     def judge(
         self,
         name: str,
-        critic: nn.Module,
+        critics: nn.ModuleDict,
         condition: Tensor,
         estimate: Tensor,
         truth: Tensor,
@@ -73,9 +78,12 @@ class Score:
         """Let a critic see estimate and truth: the adversarial and feature terms, and its own loss.
 
         The estimate is not detached from the critic's loss: `nets.trainer` takes each player's gradient with
-        respect to its own weights only, and so one pass through the critic serves both.
+        respect to its own weights only, and so one pass through the critic serves both. Without weights
+        there is no critic.
         """
-        both = critic(torch.cat([truth, estimate]), torch.cat([condition, condition]))
+        if not weights.need_critic:
+            return
+        both = critics[name](torch.cat([truth, estimate]), torch.cat([condition, condition]))
         real, fake = _halves(both)
         self.add(f"{name} adversarial", factor * weights.adversarial, generator_loss(fake))
         self.add(f"{name} features", factor * weights.feature, feature_matching(real, fake))
@@ -103,8 +111,9 @@ class Score:
         self.add(f"{name} perceptual", factor * weights.perceptual, perceptual(estimate, truth))
 
     def losses(self) -> Losses:
-        """Return the sums."""
-        return Losses(torch.stack(self.generator).sum(), self.terms, torch.stack(self.critics).sum())
+        """Return the sums; none for critics where there are none."""
+        critics = torch.stack(self.critics).sum() if self.critics else None
+        return Losses(torch.stack(self.generator).sum(), self.terms, critics)
 
 
 def exposure_gain(

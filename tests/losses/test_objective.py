@@ -324,6 +324,23 @@ def test_the_first_stage_knows_no_renderings(batch: TrainingBatch) -> None:
     assert {name for name in losses.terms if " " not in name} == {*MAPS, "light"}
 
 
+@pytest.mark.parametrize("judged", [(), ("maps",), ("rendering",)])
+def test_without_weights_there_are_no_critics(hybrid_batch: TrainingBatch, judged: tuple[str, ...]) -> None:
+    def weights(what: str) -> TermWeights:
+        return TermWeights() if what in judged else TermWeights(adversarial=0.0, feature=0.0)
+
+    objective = HybridObjective(
+        SyntheticObjective(maps=weights("maps"), rendering=weights("rendering")),
+        RealObjective(rendering=weights("real")),
+    )
+    expected = {*(MAPS if "maps" in judged else ()), *(("rendering",) if "rendering" in judged else ())}
+    assert set(objective.judged) == expected
+    losses = objective(Generator(TINY).eval(), critics_of(objective), hybrid_batch, seeded(0))
+    assert {n.split()[0] for n in losses.terms if n.endswith("adversarial")} == expected
+    assert (losses.critics is None) == (not judged)
+    losses.generator.backward()
+
+
 def test_without_vgg_its_weight_is_refused(batch: TrainingBatch) -> None:
     objective = SyntheticObjective()
     with pytest.raises(ValueError, match="give it the VGG or the weight 0"):
