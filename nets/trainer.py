@@ -8,7 +8,7 @@ from __future__ import annotations
 import contextlib
 import copy
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
@@ -58,7 +58,9 @@ class Trainer:
         for players in (self.network, self.critics):
             players.to(device=self.team.device, memory_format=torch.channels_last)  # type: ignore[call-overload]
         self.average = copy.deepcopy(self.network).eval().requires_grad_(False)
-        trained = [self.network.get_submodule(part) for part in self._known_parts()] or [self.network]
+        trained: list[nn.Module] = [self.network.get_submodule(part) for part in self._known_parts()]
+        trained = trained or [self.network]
+        self._trained_modules = trained
         self._trained = [parameter for module in trained for parameter in module.parameters()]
         self.network.requires_grad_(False)
         for parameter in self._trained:
@@ -85,7 +87,10 @@ class Trainer:
         """Run one iteration; return the loss and its terms, averaged over shards and processes."""
         start = time.perf_counter()
         phase = self.config.phase_at(self.iteration)
-        self.network.train()
+        # What is not trained is as it will be used: without dropout.
+        self.network.eval()
+        for module in self._trained_modules:
+            module.train()
         for optimizer, factor in self._optimizers():
             optimizer.zero_grad(set_to_none=True)
             for group in optimizer.param_groups:
@@ -213,15 +218,15 @@ class Trainer:
     def adopt(self, path: Path) -> None:
         """Start from the networks of another training's state: the stage before this one.
 
-        Critics that both have are taken too; optimizers and counters start anew.
+        Critics that both have are taken too; optimizers, counters and parts of the network that the state
+        lacks as a whole start anew.
 
         Raises:
             ValueError: the state's generator is another one, or it is no state at all.
         """
         state = self._load(path)
         try:
-            self.network.load_state_dict(state["network"])
-            self.average.load_state_dict(state["average"])
+            self.take_weights(state["network"], state["average"])
             for name, critic in self.critics.items():
                 prefix = f"{name}."
                 known = state.get("critics", {}).items()  # old states have none
@@ -230,6 +235,18 @@ class Trainer:
                     critic.load_state_dict(own)
         except (KeyError, RuntimeError) as error:
             raise ValueError(f"{path} is the state of another network ({_first_line(error)})") from None
+
+    def take_weights(self, weights: Mapping[str, Tensor], average: Mapping[str, Tensor]) -> None:
+        """Start from a network's weights and their moving average; parts they lack as a whole start anew.
+
+        Raises:
+            RuntimeError: they are another network's.
+        """
+        for network, given in ((self.network, weights), (self.average, average)):
+            present = {name.partition(".")[0] for name in given}
+            own = network.state_dict().items()
+            new = {name: value for name, value in own if name.partition(".")[0] not in present}
+            network.load_state_dict({**new, **given})
 
     def _load(self, path: Path) -> dict[str, Any]:
         try:

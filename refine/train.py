@@ -13,7 +13,7 @@ from losses.score import build_critics
 from losses.vgg_weights import load_vgg16
 from losses.with_vgg import give_vgg, needs_vgg
 from nets.architectures import build
-from nets.checkpoint import Record, save_model
+from nets.checkpoint import Record, load_network, save_model
 from nets.data.augment import Augmentation, augment
 from nets.data.images import DataError
 from nets.data.materials import Materials, open_materials
@@ -81,7 +81,7 @@ def train(
         list[str] | None, typer.Option(help="Only these stages of the plan, in its order; repeatable.")
     ] = None,
     start: Annotated[
-        Path | None, typer.Option(help="State (state.pt) whose networks the first stage starts from.")
+        Path | None, typer.Option(help="State (state.pt) or checkpoint that the first stage starts from.")
     ] = None,
     resume: Annotated[bool, typer.Option(help="Continue from the run's states where there are any.")] = False,
     steps: Annotated[
@@ -130,7 +130,7 @@ def train(
                 batch_source(
                     materials[part],
                     plan.augmentation,
-                    plan.photography,
+                    one.photography,
                     pairs_of[part],
                     one.pairs,
                     team.device,
@@ -151,7 +151,7 @@ def train(
             if resume and (folder / STATE).exists():
                 trainer.resume(folder / STATE)
             elif origin is not None:
-                trainer.adopt(origin)
+                _begin_at(trainer, origin)
             facts = {**plan.as_dict(one), "processes": team.world}
             left = _run(trainer, folder, facts, data_note or [], save_every, left, validation)
             if left == 0:
@@ -159,6 +159,20 @@ def train(
     except (DataError, PlanError, ValueError, OSError) as error:
         typer.echo(f"refine-train: {' '.join(str(error).split())}", err=True)
         raise typer.Exit(2) from None
+
+
+def _begin_at(trainer: Trainer, origin: Path) -> None:
+    """Start from a training's state, or from a checkpoint, which is a network without critics."""
+    if origin.suffix != ".safetensors":
+        trainer.adopt(origin)
+        return
+    weights = load_network(origin).state_dict()
+    try:
+        trainer.take_weights(weights, weights)
+    except RuntimeError:
+        raise ValueError(
+            f"--start {origin} is another network than the plan's; make the plan's generator like it"
+        ) from None
 
 
 def _run(

@@ -35,6 +35,7 @@ class Stage:
         trainer: phases, learning rates, seed.
         pairs: real pairs per shard.
         parts: of the network that are trained, as the generator calls them (`light_head`); none names all.
+        photography: how its photos are taken.
     """
 
     name: str
@@ -43,6 +44,7 @@ class Stage:
     trainer: TrainerConfig
     pairs: int = 0
     parts: tuple[str, ...] = ()
+    photography: FlashPhotography = field(default_factory=FlashPhotography)
 
 
 @dataclass(frozen=True)
@@ -54,7 +56,6 @@ class TrainingPlan:
         stages: in order; each starts from the networks of the last one of its shape before it.
         shares: how often each collection of a pool is drawn; empty draws every material alike.
         augmentation: how materials are varied.
-        photography: how they are photographed.
         precision: `32-true` or `bf16-mixed`.
     """
 
@@ -62,7 +63,6 @@ class TrainingPlan:
     stages: tuple[Stage, ...]
     shares: Mapping[str, float] = field(default_factory=dict)
     augmentation: Augmentation = field(default_factory=Augmentation)
-    photography: FlashPhotography = field(default_factory=FlashPhotography)
     precision: str = "32-true"
 
     def as_dict(self, stage: Stage) -> dict[str, Any]:
@@ -75,7 +75,7 @@ class TrainingPlan:
             "parts": list(stage.parts),
             "shares": dict(self.shares),
             "augmentation": asdict(self.augmentation),
-            "photography": asdict(self.photography),
+            "photography": asdict(stage.photography),
             "precision": self.precision,
         }
 
@@ -118,7 +118,8 @@ def plan_of(content: Any) -> TrainingPlan:
     common = _mapping(entries.get("trainer", {}), "trainer")
     if not isinstance(entries["stages"], list) or not entries["stages"]:
         raise ValueError("stages must be a list of at least one stage")
-    stages = tuple(_stage(stage, common, generator) for stage in entries["stages"])
+    photography = override(FlashPhotography(), _mapping(entries.get("photography", {}), "photography"))
+    stages = tuple(_stage(stage, common, generator, photography) for stage in entries["stages"])
     names = [stage.name for stage in stages]
     if len(set(names)) != len(names):
         raise ValueError(f"stages must have names of their own, got {', '.join(names)}")
@@ -134,7 +135,6 @@ def plan_of(content: Any) -> TrainingPlan:
         stages=stages,
         shares={name: float(share) for name, share in shares.items()},
         augmentation=override(Augmentation(), _mapping(entries.get("augmentation", {}), "augmentation")),
-        photography=override(FlashPhotography(), _mapping(entries.get("photography", {}), "photography")),
         precision=precision,
     )
 
@@ -142,8 +142,16 @@ def plan_of(content: Any) -> TrainingPlan:
 OPTIONAL = ("generator", "critics", "trainer", "shares", "augmentation", "photography", "precision")
 
 
-def _stage(content: Any, common: Mapping[str, Any], generator: NetworkConfig | None) -> Stage:
-    required, optional = ("name", "objective", "phases"), ("network", "trainer", "pairs", "parts")
+STAGE_OPTIONAL = ("network", "trainer", "pairs", "parts", "photography")
+
+
+def _stage(
+    content: Any,
+    common: Mapping[str, Any],
+    generator: NetworkConfig | None,
+    photography: FlashPhotography,
+) -> Stage:
+    required, optional = ("name", "objective", "phases"), STAGE_OPTIONAL
     entries = _mapping(content, "a stage", required=required, optional=optional)
     name = str(entries["name"])
     where = f"stage {name}"
@@ -179,7 +187,8 @@ def _stage(content: Any, common: Mapping[str, Any], generator: NetworkConfig | N
     parts = entries.get("parts", [])
     if not isinstance(parts, list) or not all(isinstance(part, str) for part in parts):
         raise ValueError(f"{where}: parts must be a list of the network's parts, got {parts!r}")
-    return Stage(name, network, objective, trainer, pairs, tuple(parts))
+    own = _mapping(entries.get("photography", {}), f"{where}: photography")
+    return Stage(name, network, objective, trainer, pairs, tuple(parts), override(photography, own))
 
 
 def _network(content: Any, where: str) -> NetworkConfig:

@@ -85,9 +85,16 @@ def a_critic() -> nn.ModuleDict:
     return nn.ModuleDict({"maps": nn.Sequential(*layers)})
 
 
-def trainer(source: BatchSource = random_source, team: Team | None = None, **changes: Any) -> Trainer:
+def trainer(
+    source: BatchSource = random_source,
+    team: Team | None = None,
+    network: GeneratorConfig = TINY,
+    parts: tuple[str, ...] = (),
+    **changes: Any,
+) -> Trainer:
     torch.manual_seed(0)
-    return Trainer(Generator(TINY), source, objective, replace(CONFIG, **changes), team=team or Alone())
+    config = replace(CONFIG, **changes)
+    return Trainer(Generator(network), source, objective, config, team=team or Alone(), parts=parts)
 
 
 def player(source: BatchSource = random_source, team: Team | None = None, **changes: Any) -> Trainer:
@@ -324,6 +331,29 @@ def test_states_of_other_networks_are_refused_in_one_sentence(tmp_path: Path) ->
     player().save(path)
     with pytest.raises(ValueError, match="another network or objective"):
         trainer().resume(path)  # has critics nobody asks for
+
+
+def test_parts_that_a_network_lacks_as_a_whole_begin_anew() -> None:
+    plain, larger = trainer(), trainer(network=replace(TINY, revision_channels=2))
+    new = {k: v.clone() for k, v in larger.network.state_dict().items() if k.startswith("revision.")}
+    assert new
+    weights = plain.network.state_dict()
+    larger.take_weights(weights, plain.average.state_dict())
+    for network in (larger.network, larger.average):
+        assert_same_bits(network.state_dict(), {**weights, **new})
+    del weights["encoder.0.weight"]
+    with pytest.raises(RuntimeError, match=r"encoder\.0\.weight"):
+        trainer().take_weights(weights, weights)
+
+
+def test_only_the_named_parts_are_trained_and_only_they_drop_out() -> None:
+    run = trainer(parts=("light_head",))
+    before = {name: value.clone() for name, value in run.network.state_dict().items()}
+    run.step()
+    moved = {name for name, value in run.network.state_dict().items() if not torch.equal(value, before[name])}
+    assert moved
+    assert all(name.startswith("light_head.") for name in moved)
+    assert {name for name, module in run.network.named_children() if module.training} == {"light_head"}
 
 
 def test_a_stage_adopts_networks_and_starts_anew(tmp_path: Path) -> None:

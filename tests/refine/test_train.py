@@ -262,6 +262,16 @@ def test_a_stage_starts_from_the_networks_of_the_one_before(command: Command, tm
     assert command("--config", plan, "--stage", "syn", *start, out="elsewhere") == (0, "")
     assert_same_training(tmp_path / "run" / "syn", tmp_path / "elsewhere" / "syn")
 
+    # From a checkpoint alone, whose float16 weights are all there is of it.
+    weights = tmp_path / "apart" / "l1" / "weights.safetensors"
+    assert command("--config", plan, "--stage", "syn", "--start", weights, out="alone") == (0, "")
+    alone = torch.load(tmp_path / "alone" / "syn" / STATE, weights_only=True)["network"]
+    for name, value in load_network(weights).state_dict().items():
+        assert_close(alone[name], value, atol=1e-6)
+    other = write_plan(tmp_path / "other.yaml", STAGES["l1"], generator={**GENERATOR, "width": 3})
+    code, said = command("--config", other, "--start", weights, out="other")
+    assert (code, "is another network than the plan's" in said) == (2, True)
+
 
 def test_resuming_goes_on_where_it_stopped(
     command: Command, tmp_path: Path, monkeypatch: pytest.MonkeyPatch

@@ -79,7 +79,8 @@ def test_the_plan_of_the_baselines_is_of_the_networks_that_are_shipped() -> None
     assert [stage.objective for stage in plan.stages] == [replace(DES18, map_weight=0.1), DES19, GAO19]
     narrow = read_plan(CONFIGS / "narrow.yaml")
     assert plan.shares == narrow.shares
-    assert (plan.augmentation, plan.photography) == (narrow.augmentation, narrow.photography)
+    assert plan.augmentation == narrow.augmentation
+    assert {stage.photography for stage in plan.stages} == {narrow.stages[0].photography}
 
 
 @pytest.mark.parametrize("path", sorted(CONFIGS.glob("*.yaml")), ids=lambda path: path.name)
@@ -104,25 +105,33 @@ def test_a_stage_overrides_what_is_common() -> None:
             "trainer": {"learning_rate": 1, "ema_decay": 0.5},
             "shares": {"procedural": 2},
             "augmentation": {"scale": [0.5, 1]},
-            "photography": {"lights": {"max_angle": 10}},
+            "photography": {"falloff_share": 0.5, "lights": {"max_angle": 10}},
             "stages": [
                 {
                     "name": 7,
                     "objective": {"kind": "l1", "map_weight": 3},
                     "phases": [{"iterations": 1, "crop": 16, "batch": 1, "shards": 2}],
                     "trainer": {"learning_rate": 0.5},
-                }
+                    "photography": {"lights": {"max_angle": 20}},
+                },
+                {
+                    "name": "next",
+                    "objective": {"kind": "l1"},
+                    "phases": [{"iterations": 1, "crop": 16, "batch": 1}],
+                },
             ],
         }
     )
-    (stage,) = plan.stages
+    stage, plain = plan.stages
     assert isinstance(stage, Stage)
     assert (stage.name, stage.objective) == ("7", L1Objective(map_weight=3.0))
     assert (stage.trainer.learning_rate, stage.trainer.ema_decay) == (0.5, 0.5)
     assert stage.trainer.phases == (Phase(1, 16, 1, 2),)
     assert plan.shares == {"procedural": 2.0}
     assert plan.augmentation.scale == (0.5, 1.0)
-    assert plan.photography.lights.max_angle == 10.0
+    taken = [(one.photography.falloff_share, one.photography.lights.max_angle) for one in (stage, plain)]
+    assert taken == [(0.5, 20.0), (0.5, 10.0)]
+    assert plan.as_dict(stage)["photography"]["lights"]["max_angle"] == 20.0
     assert (plan.precision, plan.critics) == ("32-true", {})
 
 
@@ -173,6 +182,7 @@ MISTAKES: list[tuple[str, Any, str]] = [
     ("augmentation/soup", 1, "Augmentation has no 'soup'"),
     ("augmentation/scale", 0.5, "Augmentation.scale must be of type tuple, got 0.5"),
     ("photography/lights/soup", 1, "LightDistribution has no 'soup'"),
+    ("stages/0/photography", {"soup": 1}, "FlashPhotography has no 'soup'"),
     ("precision", 16, "precision must be one of 32-true, bf16-mixed, got 16"),
     ("stages/0/name", ABSENT, "a stage lacks name"),
     ("stages/0/name", "hyb", "stages must have names of their own, got hyb, hyb"),
