@@ -16,12 +16,16 @@ from torch.nn import functional
 from nets.color import to_network_input
 from nets.light_head import LEAKY_SLOPE, LightEncoder, LightHead, light_from_output
 from nets.render import PointLight
+from nets.revision import Revision, feedback
 from nets.shading_cues import CUES, shading_cues
 from nets.svbrdf import CHANNELS, MAPS, SVBRDF
 
 DROPOUT = 0.5
 DROPOUT_LEVELS = 3
 """Dropout follows this many of the deepest decoder levels."""
+
+REVISION_LEVELS = 3
+"""A revision halves the photo as often as this, so the encoder must too."""
 
 DETAIL_FEATURES = 2
 """Channels beyond its map that each decoder hands to the full-resolution layers."""
@@ -46,6 +50,8 @@ class GeneratorConfig:
             leaves them out, as the paper does.
         light_channels: of the first convolution of a `LightEncoder`; 0 leaves it out for the paper's head on
             the bottleneck.
+        revision_channels: at full resolution, of the second look that sees the maps' own re-rendering, see
+            `Revision`; 0 leaves it out, as the paper does.
     """
 
     width: int = 64
@@ -54,6 +60,7 @@ class GeneratorConfig:
     shading_cues: bool = False
     detail_channels: int = 0
     light_channels: int = 0
+    revision_channels: int = 0
 
     def __post_init__(self) -> None:
         """Refuse shapes that cannot be built."""
@@ -62,6 +69,8 @@ class GeneratorConfig:
             or self.deep_multiplier < 1
             or self.detail_channels < 0
             or self.light_channels < 0
+            or self.revision_channels < 0
+            or (self.revision_channels and self.levels < REVISION_LEVELS)
             or not 2 <= self.levels <= 10
         ):
             raise ValueError(f"not a generator: {self}")
@@ -214,6 +223,8 @@ class Generator(nn.Module):
             LightEncoder(config.light_channels) if config.light_channels else LightHead(widths[-1])
         )
         self.detail = Detail(config) if config.detail_channels else None
+        revised = config.revision_channels
+        self.revision = Revision(revised, config.inputs) if revised else None
 
     def see(self, photo: Float[Tensor, "b 3 h w"]) -> Float[Tensor, "b inputs h w"]:
         """Return what the first convolution sees: the photo and, if so configured, its shading cues."""
@@ -247,7 +258,13 @@ class Generator(nn.Module):
         if self.detail is not None:
             more = torch.cat([decoded[name][:, CHANNELS[name] :] for name in MAPS], dim=1)
             maps = maps + self.detail(maps, more, seen)
-        return torch.tanh(maps), self.light_head(photo if self.config.light_channels else features[-1])
+        light = self.light_head(photo if self.config.light_channels else features[-1])
+        if self.revision is not None:
+            estimate = torch.tanh(maps.float())
+            lit = light_from_output(light.detach().float())
+            found = feedback(maps_to_svbrdf(estimate.detach()), lit, photo)
+            maps = maps + self.revision(seen, estimate, found)
+        return torch.tanh(maps), light
 
     def estimate_light(self, photo: Float[Tensor, "b 3 h w"]) -> Float[Tensor, "b 3"]:
         """Return what `forward` says of the light, without the decoders: a fifth of the work or less."""
