@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 from nets.baselines.autoencoder import Autoencoder, AutoencoderConfig
 from nets.baselines.des18 import Des18, Des18Config
 from nets.baselines.des19 import Des19, Des19Config
@@ -33,6 +35,13 @@ def find_config(kind: str) -> type[NetworkConfig]:
     if kind not in CONFIGS:
         raise ValueError(f"no network is called {kind!r}; the known ones are {', '.join(CONFIGS)}")
     return CONFIGS[kind]
+
+
+def continues(config: NetworkConfig, earlier: NetworkConfig) -> bool:
+    """Return whether a network can start from another: its like, or one that has no revision yet."""
+    if isinstance(config, GeneratorConfig) and isinstance(earlier, GeneratorConfig):
+        return earlier in (config, replace(config, revision_channels=0))
+    return config == earlier
 
 
 def build(config: NetworkConfig) -> Network:

@@ -97,7 +97,13 @@ class GeneratorConfig:
 
 PAPER_GENERATOR = GeneratorConfig()
 NARROW_GENERATOR = GeneratorConfig(
-    width=16, levels=7, deep_multiplier=4, shading_cues=True, detail_channels=16, light_channels=24
+    width=16,
+    levels=7,
+    deep_multiplier=4,
+    shading_cues=True,
+    detail_channels=16,
+    light_channels=24,
+    revision_channels=16,
 )
 """What is trained on two CPU cores and shipped: see docs/architecture.md for what differs and why."""
 

@@ -12,7 +12,7 @@ import typer
 from losses.score import build_critics
 from losses.vgg_weights import load_vgg16
 from losses.with_vgg import give_vgg, needs_vgg
-from nets.architectures import build
+from nets.architectures import build, continues
 from nets.checkpoint import Record, load_network, save_model
 from nets.data.augment import Augmentation, augment
 from nets.data.images import DataError
@@ -237,19 +237,19 @@ def _check_shards(stages: list[Stage], processes: int) -> None:
 def _origin(
     stage: Stage, plan: TrainingPlan, chosen: list[Stage], out: Path, start: Path | None
 ) -> Path | None:
-    """Return the state whose networks a stage starts from; None for the plan's first of their shape.
+    """Return the state whose networks a stage starts from; None for the plan's first that it could continue.
 
     It is that of the stage trained before it in this run; else `--start`; else that of the stage before it in
     the plan, from a run of before.
     """
-    earlier = [one for one in chosen[: chosen.index(stage)] if one.network == stage.network]
+    earlier = [one for one in chosen[: chosen.index(stage)] if continues(stage.network, one.network)]
     if earlier:
         return out / earlier[-1].name / STATE
     if start is not None:
         if not start.is_file():
             raise PlanError(f"--start {start} is not a file")
         return start
-    before = [one for one in plan.stages[: plan.stages.index(stage)] if one.network == stage.network]
+    before = [one for one in plan.stages[: plan.stages.index(stage)] if continues(stage.network, one.network)]
     if not before:
         return None
     origin = out / before[-1].name / STATE

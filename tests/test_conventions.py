@@ -1177,7 +1177,7 @@ def test_modules_of_the_architecture_page() -> None:
 def test_sizes_of_the_architecture_page() -> None:
     sizes: tuple[tuple[NetworkConfig, str], ...] = (
         (PAPER_GENERATOR, "231.8 M"),
-        (NARROW_GENERATOR, "4.50 M"),
+        (NARROW_GENERATOR, "4.70 M"),
         (PAPER_DES18, "79.98 M"),
         (NARROW_DES18, "1.249 M"),
         (PAPER_DES19, "80.25 M"),

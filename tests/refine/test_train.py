@@ -268,6 +268,15 @@ def test_a_stage_starts_from_the_networks_of_the_one_before(command: Command, tm
     alone = torch.load(tmp_path / "alone" / "syn" / STATE, weights_only=True)["network"]
     for name, value in load_network(weights).state_dict().items():
         assert_close(alone[name], value, atol=1e-6)
+    # Behind it in the same run, with a part that is new.
+    larger = {"kind": "generator", **GENERATOR, "revision_channels": 2}
+    revise = {**still, "name": "revise", "network": larger, "parts": ["revision"]}
+    both = write_plan(tmp_path / "both.yaml", STAGES["l1"], revise)
+    assert command("--config", both, out="both") == (0, "")
+    found = torch.load(tmp_path / "both" / "revise" / STATE, weights_only=True)["network"]
+    assert any(name.startswith("revision.") for name in found)
+    for name, value in first["network"].items():
+        assert_close(found[name], value, atol=1e-6)
     other = write_plan(tmp_path / "other.yaml", STAGES["l1"], generator={**GENERATOR, "width": 3})
     code, said = command("--config", other, "--start", weights, out="other")
     assert (code, "is another network than the plan's" in said) == (2, True)

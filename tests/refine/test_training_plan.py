@@ -55,9 +55,10 @@ def test_the_paper_s_plan_has_the_paper_s_numbers() -> None:
 
 def test_the_narrow_plan_is_of_the_network_that_is_shipped() -> None:
     plan = read_plan(CONFIGS / "narrow.yaml")
-    assert {stage.network for stage in plan.stages} == {NARROW_GENERATOR}
-    assert [stage.name for stage in plan.stages] == ["l1", "syn", "light", "hyb"]
-    kinds = (L1Objective, SyntheticObjective, LightObjective, HybridObjective)
+    assert [stage.name for stage in plan.stages] == ["l1", "syn", "light", "hyb", "revise"]
+    first = replace(NARROW_GENERATOR, revision_channels=0)
+    assert [stage.network for stage in plan.stages] == [*[first] * 4, NARROW_GENERATOR]
+    kinds = (L1Objective, SyntheticObjective, LightObjective, HybridObjective, SyntheticObjective)
     for stage, kind in zip(plan.stages, kinds, strict=True):
         assert isinstance(stage.objective, kind)
         assert {phase.shards for phase in stage.trainer.phases} == {2}
@@ -65,9 +66,10 @@ def test_the_narrow_plan_is_of_the_network_that_is_shipped() -> None:
     real = {"camera": {"kind": "collocated"}, "rendering": {"perceptual": 1.0}, "perceptual_layers": 3}
     changes = {"synthetic": {"maps": {"adversarial": 0.1}}, "real": real, "real_weight": 1.0}
     assert plan.stages[3].objective == override(NARROW, changes)
-    light, others = ({*stage.parts} for stage in plan.stages[2:])
-    assert light == {"light_head"}
-    assert others | light == {name for name, _ in build(NARROW_GENERATOR).named_children()}
+    light, others, revision = ({*stage.parts} for stage in plan.stages[2:])
+    assert (light, revision) == ({"light_head"}, {"revision"})
+    assert not plan.stages[4].objective.judged
+    assert others | light | revision == {name for name, _ in build(NARROW_GENERATOR).named_children()}
     assert plan.precision == "bf16-mixed"
 
 
