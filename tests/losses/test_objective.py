@@ -741,7 +741,7 @@ NETWORKS: dict[str, NetworkConfig] = {
     "revise": GeneratorConfig(width=4, levels=3, deep_multiplier=2, revision_channels=8),
     "des18": Des18Config(width=4, levels=2, deep_multiplier=2),
     "des19": Des19Config(width=4, levels=2, deep_multiplier=2),
-    "gao19": AutoencoderConfig(width=4),
+    "gao19": AutoencoderConfig(width=8),
 }
 """Other than the plain generator."""
 
@@ -755,8 +755,8 @@ def test_200_iterations_of_every_stage_improve_its_objective(name: str) -> None:
     objective = STAGES[name]
     torch.manual_seed(0)
     # Nothing in the auto-encoder is normalised, and its code is a 32nd of the material.
-    side, rate = (32, 1e-2) if name == "gao19" else (16, 2e-3)
-    config = TrainerConfig((Phase(200, crop=side, batch=2),), learning_rate=rate, warmup=10, seed=1)
+    side, rate, count = (32, 1e-2, 4) if name == "gao19" else (16, 2e-3, 2)
+    config = TrainerConfig((Phase(200, crop=side, batch=count),), learning_rate=rate, warmup=10, seed=1)
     source: BatchSource = lit_source
     run = Trainer(
         build(NETWORKS.get(name, GeneratorConfig(width=4, levels=2, deep_multiplier=2))),
