@@ -16,16 +16,13 @@ from torch.nn import functional
 from nets.color import to_network_input
 from nets.light_head import LEAKY_SLOPE, LightEncoder, LightHead, light_from_output
 from nets.render import PointLight
-from nets.revision import Revision, feedback
+from nets.revision import REVISION_WIDTHS, Revision, feedback
 from nets.shading_cues import CUES, shading_cues
 from nets.svbrdf import CHANNELS, MAPS, SVBRDF
 
 DROPOUT = 0.5
 DROPOUT_LEVELS = 3
 """Dropout follows this many of the deepest decoder levels."""
-
-REVISION_LEVELS = 3
-"""A revision halves the photo as often as this, so the encoder must too."""
 
 DETAIL_FEATURES = 2
 """Channels beyond its map that each decoder hands to the full-resolution layers."""
@@ -70,7 +67,7 @@ class GeneratorConfig:
             or self.detail_channels < 0
             or self.light_channels < 0
             or self.revision_channels < 0
-            or (self.revision_channels and self.levels < REVISION_LEVELS)
+            or (self.revision_channels and self.levels < len(REVISION_WIDTHS))
             or not 2 <= self.levels <= 10
         ):
             raise ValueError(f"not a generator: {self}")
@@ -229,8 +226,8 @@ class Generator(nn.Module):
             LightEncoder(config.light_channels) if config.light_channels else LightHead(widths[-1])
         )
         self.detail = Detail(config) if config.detail_channels else None
-        revised = config.revision_channels
-        self.revision = Revision(revised, config.inputs) if revised else None
+        channels = config.revision_channels
+        self.revision = Revision(channels, config.inputs) if channels else None
 
     def see(self, photo: Float[Tensor, "b 3 h w"]) -> Float[Tensor, "b inputs h w"]:
         """Return what the first convolution sees: the photo and, if so configured, its shading cues."""
