@@ -9,16 +9,13 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from nets.color import GAMMA
+from nets.color import gamma_encode_from_floor
 from nets.generator import svbrdf_to_maps
 from nets.render import Camera, PointLight, render
 from nets.svbrdf import CHANNELS, MAPS, SVBRDF
 
 LOG_OFFSET = 0.01
 """Added to linear radiance before the logarithm (Deschaintre et al. 2018, Gao et al. 2019)."""
-
-ENCODING_FLOOR = 1e-3
-"""Radiance below this counts as black in `encoded_difference`, whose slope grows without bound towards 0."""
 
 
 def map_l1(estimate: SVBRDF, truth: SVBRDF) -> dict[str, Float[Tensor, ""]]:
@@ -44,8 +41,7 @@ def encoded_difference(
     image: Float[Tensor, "*shape"], reference: Float[Tensor, "*shape"]
 ) -> Float[Tensor, "*shape"]:
     """Return the difference of gamma-encoded pictures; radiance above 1 is not clipped here."""
-    encoded, other = (x.clamp(min=ENCODING_FLOOR) ** (1.0 / GAMMA) for x in (image, reference))
-    return encoded - other
+    return gamma_encode_from_floor(image) - gamma_encode_from_floor(reference)
 
 
 def log_l1(

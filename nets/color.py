@@ -12,6 +12,9 @@ from torch import Tensor
 GAMMA = 2.2
 """Exponent of the network's and the metrics' encoding (paper Sec. 5.2: "gamma correct")."""
 
+ENCODING_FLOOR = 1e-3
+"""Radiance below this is black in `gamma_encode_from_floor`: the slope grows without bound towards 0."""
+
 GAMMA_FLOOR = 1e-6
 """Linear value below which the 1/2.2 power is not followed: its slope is infinite at 0."""
 
@@ -47,3 +50,11 @@ def luminance(image: Float[Tensor, "*batch 3 h w"]) -> Float[Tensor, "*batch 1 h
     """Rec. 709 luminance of linear RGB."""
     weights = torch.tensor([0.2126, 0.7152, 0.0722], dtype=image.dtype, device=image.device)
     return (image * weights[:, None, None]).sum(dim=-3, keepdim=True)
+
+
+def gamma_encode_from_floor(image: Float[Tensor, "*shape"]) -> Float[Tensor, "*shape"]:
+    """Encode linear light with the 1/2.2 power, black below `ENCODING_FLOOR` and not clipped at 1.
+
+    For differences that gradients flow through: the slope stays bounded, also where it is too bright.
+    """
+    return image.clamp(min=ENCODING_FLOOR) ** (1.0 / GAMMA)

@@ -15,7 +15,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn import functional
 
-from nets.color import GAMMA
+from nets.color import gamma_encode_from_floor
 from nets.light_head import LEAKY_SLOPE
 from nets.render import PAPER, Camera, Geometry, PointLight, shade, shading_geometry, surface_points
 from nets.svbrdf import CHANNELS, MAPS, SVBRDF
@@ -34,9 +34,6 @@ STEP_WIDTHS = {"normal": 0.14, "diffuse": 0.12, "roughness": 0.16, "specular": 0
 
 STEP_NOISE = 0.02
 """Encoded difference that `explaining_step` need not explain."""
-
-ENCODING_FLOOR = 1e-3
-"""Radiance below this is black: the slope of the encoding grows without bound towards 0."""
 
 REVISION_WIDTHS = (1.5, 3.0, 4.0)
 """Channels at half, quarter and eighth resolution, as multiples of those at full resolution."""
@@ -94,8 +91,7 @@ def explaining_step(
         leaf = estimate.map(lambda tensor: tensor.detach().clone().requires_grad_())
         unit = functional.normalize(leaf.normal, dim=1)
         material = SVBRDF(unit, leaf.diffuse, leaf.roughness, leaf.specular)
-        radiance = shade(material, geometry)
-        rendering = radiance.clamp(min=ENCODING_FLOOR) ** (1.0 / GAMMA)
+        rendering = gamma_encode_from_floor(shade(material, geometry))
         shown = torch.where(target < 1.0, rendering, rendering.clamp(max=1.0))
         tensors = [getattr(leaf, name) for name in MAPS]
         rows = [

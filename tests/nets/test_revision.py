@@ -5,11 +5,10 @@ from __future__ import annotations
 import pytest
 import torch
 
-from nets.color import to_network_input
+from nets.color import ENCODING_FLOOR, to_network_input
 from nets.generator import Generator, GeneratorConfig
 from nets.render import Camera, PointLight, render, shade, shading_geometry, surface_points
 from nets.revision import (
-    ENCODING_FLOOR,
     FEEDBACK,
     LARGEST_FEEDBACK,
     RESIDUAL_SCALE,
