@@ -21,7 +21,7 @@ from eval.datasets import SIZE, Protocol, input_photo
 from eval.development import DEVELOPMENT, TestSet, read_scenes, require
 from eval.report import Results, markdown_table, number, origin, skipped_lines
 from nets.data.photography import FlashPhotography
-from nets.render import AUTHORS_CAMERA
+from nets.light_head import at_height
 from refine.capture import Capture
 from refine.initialization import initialize
 from refine.light import fit_light
@@ -49,7 +49,8 @@ class LightScore:
         distance: true one from the patch centre, surface units.
         direction_error: angle between true and estimated direction from the patch centre, degrees.
         distance_error: of the estimated distance, as a share of the true one.
-        direction_error_at_height: of the direction, once the true height is put in, see `at_height`.
+        direction_error_at_height: of the direction, once it is moved to the true height, see `at_height`.
+            What is left is not about the height.
     """
 
     method: str
@@ -143,23 +144,6 @@ def light_errors(estimate: Float[Tensor, "3"], truth: Float[Tensor, "3"]) -> tup
     return math.degrees(float(angle)), abs(float(ratio) - 1.0)
 
 
-def at_height(
-    estimate: Float[Tensor, "3"], height: float, camera_height: float = AUTHORS_CAMERA[2]
-) -> Float[Tensor, "3"]:
-    """Return an estimated light moved to another height, with a mirror's highlight where it was.
-
-    A camera at height c over the centre sees the highlight at `c / (c + z)` of the light's x and y: one
-    highlight, many lights. What is left of an estimate's error at the true height is not about the height.
-
-    Args:
-        estimate: position of the light.
-        height: the z it is moved to.
-        camera_height: the camera's z.
-    """
-    share = (camera_height + height) / (camera_height + float(estimate[2]))
-    return torch.cat([estimate[:2] * share, estimate.new_tensor([height])])
-
-
 def evaluate_lights(
     estimate: LightEstimator,
     data: Path,
@@ -196,7 +180,7 @@ def evaluate_lights(
             where = (math.degrees(math.atan2(math.hypot(x, y), z)), math.hypot(x, y, z))
             for method, position in estimate(photo).items():
                 errors = light_errors(position, truth)
-                told = light_errors(at_height(position, z), truth)[0]
+                told = light_errors(at_height(position[None], truth[None, 2])[0], truth)[0]
                 results.scored.append(LightScore(method, test_set.name, scene.name, *where, *errors, told))
         if progress is not None:
             progress(scene.name)

@@ -1,4 +1,4 @@
-"""What the light encoder is trained on, alone: direction and distance of the flash."""
+"""What the light encoder is trained on, alone: direction and height of the flash."""
 
 from __future__ import annotations
 
@@ -10,22 +10,22 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from nets.generator import Generator
-from nets.light_head import light_from_output
+from nets.light_head import at_height, light_from_output
 from nets.training import Losses, TrainingBatch
 
 
 @dataclass(frozen=True)
 class LightObjective:
-    """Angle between true and estimated direction, and the difference of the logarithms of distances.
+    """Angle between true and estimated direction at one height, and the difference of heights' logarithms.
 
-    Eq. 1's L1 of positions is led by far lights, which look alike; how a surface is shaded depends on the
-    direction first.
+    Eq. 1's L1 of positions is led by far lights, which look alike. What a photo shows is its highlight, so
+    directions are compared once the true light is moved to the estimate's height (`at_height`).
 
     Attributes:
-        distance_weight: of the distances' term; the angle, in radians, weighs 1.
+        height_weight: of the heights' term; the angle, in radians, weighs 1.
     """
 
-    distance_weight: float = 0.3
+    height_weight: float = 0.3
 
     @property
     def judged(self) -> dict[str, int]:
@@ -41,20 +41,14 @@ class LightObjective:
     ) -> Losses:
         """Return the loss and its parts on one batch."""
         estimate = light_from_output(network.estimate_light(batch.network_input).float()).position
+        height, truth = estimate[:, 2], batch.light.position
         terms = {
-            "direction": angle_between(estimate, batch.light.position).mean(),
-            "distance": log_ratio(estimate, batch.light.position).mean(),
+            "direction": angle_between(estimate, at_height(truth, height.detach())).mean(),
+            "height": (height.log() - truth[:, 2].log()).abs().mean(),
         }
-        return Losses(terms["direction"] + self.distance_weight * terms["distance"], terms)
+        return Losses(terms["direction"] + self.height_weight * terms["height"], terms)
 
 
 def angle_between(a: Float[Tensor, "b 3"], b: Float[Tensor, "b 3"]) -> Float[Tensor, "b"]:
     """Return the angles between vectors, radians; gradients are finite at any angle but 0 and pi."""
     return torch.atan2(torch.linalg.vector_norm(torch.linalg.cross(a, b), dim=1), (a * b).sum(dim=1))
-
-
-def log_ratio(a: Float[Tensor, "b 3"], b: Float[Tensor, "b 3"]) -> Float[Tensor, "b"]:
-    """Return how far apart the logarithms of vectors' lengths are."""
-    lengths = (torch.linalg.vector_norm(vector, dim=1) for vector in (a, b))
-    first, second = (length.log() for length in lengths)
-    return (first - second).abs()

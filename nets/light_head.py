@@ -12,7 +12,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn import functional
 
-from nets.render import PointLight
+from nets.render import AUTHORS_CAMERA, PointLight
 
 LEAKY_SLOPE = 0.2
 
@@ -34,14 +34,14 @@ LIGHT_ENCODER_WIDTHS = (1, 2, 4, 4, 6)
 LIGHT_PLACES = 4
 """Its last features are averaged over this many by this many places."""
 
-LIGHT_ENCODER_LAYERS = (256, 128, 3)
+LIGHT_ENCODER_LAYERS = (256, 128, 2)
 """Widths of the fully connected layers behind them."""
 
-LIGHT_HEIGHT = (1.0, 0.6)
-"""What it takes for granted of the logarithm of the light's height: mean and deviation."""
+LIGHT_HEIGHT = AUTHORS_CAMERA[2]
+"""Height of the flash that it takes for granted, surface units: that of the camera, where flashes are."""
 
 LIGHT_SLOPE = 0.5
-"""The light's x and y are its outputs times this and its height."""
+"""The light's x and y are its outputs times this and that height."""
 
 
 class LightHead(nn.Module):
@@ -67,7 +67,9 @@ class LightEncoder(nn.Module):
 
     The bottleneck of a narrow generator is made for maps and forgets where in the photo things are. This sees
     the photo at 128 px with the coordinates of its pixels, and is trained by itself at a hundredth of a
-    generator's cost. It speaks of direction and height: far lights do not weigh more than near ones.
+    generator's cost. It says where the highlight is and no more: which of the lights behind one highlight it
+    is, near or far, photos of unknown materials hardly tell (docs/training-log.md), so it puts the flash at
+    the camera's height.
     """
 
     def __init__(self, channels: int) -> None:
@@ -95,10 +97,8 @@ class LightEncoder(nn.Module):
         x = functional.adaptive_avg_pool2d(x, LIGHT_PLACES).flatten(1)
         for layer in self.layers[:-1]:
             x = functional.leaky_relu(layer(x), LEAKY_SLOPE)
-        slope_x, slope_y, height = self.layers[-1](x).float().unbind(dim=1)
-        mean, deviation = LIGHT_HEIGHT
-        z = torch.exp(height * deviation + mean)
-        return light_to_output(torch.stack([slope_x * LIGHT_SLOPE * z, slope_y * LIGHT_SLOPE * z, z], dim=1))
+        aside = self.layers[-1](x).float() * (LIGHT_SLOPE * LIGHT_HEIGHT)
+        return light_to_output(torch.cat([aside, torch.full_like(aside[:, :1], LIGHT_HEIGHT)], dim=1))
 
 
 def light_from_output(output: Float[Tensor, "b 3"]) -> PointLight:
@@ -111,3 +111,20 @@ def light_from_output(output: Float[Tensor, "b 3"]) -> PointLight:
 def light_to_output(position: Float[Tensor, "b 3"]) -> Float[Tensor, "b 3"]:
     """Standardise a light position: the light head's target."""
     return (position - position.new_tensor(LIGHT_MEAN)) / position.new_tensor(LIGHT_DEVIATION)
+
+
+def at_height(
+    position: Float[Tensor, "b 3"], height: Float[Tensor, "b"], camera_height: float = AUTHORS_CAMERA[2]
+) -> Float[Tensor, "b 3"]:
+    """Return lights moved to other heights, with a flat mirror's highlights where they were.
+
+    A camera at height c over the centre sees the highlight at `c / (c + z)` of the light's x and y: one
+    highlight, many lights.
+
+    Args:
+        position: of the lights, surface units.
+        height: the z that each is moved to.
+        camera_height: the camera's z.
+    """
+    share = (camera_height + height) / (camera_height + position[:, 2])
+    return torch.cat([position[:, :2] * share[:, None], height[:, None]], dim=1)

@@ -17,14 +17,13 @@ from eval.lights import (
     BANDS,
     LightResults,
     LightScore,
-    at_height,
     evaluate_lights,
     light_errors,
     light_estimator,
     lights_markdown,
     off_centre,
 )
-from nets.render import AUTHORS_CAMERA, PointLight, render
+from nets.render import PointLight, render
 from nets.svbrdf import SVBRDF
 from refine.refiner import Refiner
 from tests.eval_files import material
@@ -73,22 +72,6 @@ def test_lights_depend_on_index_and_seed_only() -> None:
 def test_errors(estimate: tuple[float, ...], direction: float, distance: float) -> None:
     found = light_errors(torch.tensor(estimate), torch.tensor([0.0, 0.0, 2.0]))
     assert found == (pytest.approx(direction, abs=1e-5), pytest.approx(distance, abs=1e-6))
-
-
-@pytest.mark.parametrize("height", [1.0, 2.4, 7.0])
-def test_a_light_at_another_height_has_its_mirror_image_at_the_same_place(height: float) -> None:
-    camera = torch.tensor(AUTHORS_CAMERA, dtype=torch.float64)
-    light = torch.tensor([0.6, -0.4, 2.4], dtype=torch.float64)
-    moved = at_height(light, height)
-    assert float(moved[2]) == height
-
-    def bisects(position: Tensor, place: Tensor) -> bool:
-        towards = [torch.nn.functional.normalize(point - place, dim=0) for point in (position, camera)]
-        return bool((sum(towards)[:2].abs() < 1e-12).all())  # half vector upright
-
-    place = torch.cat([light[:2] * camera[2] / (camera[2] + light[2]), light.new_zeros(1)])
-    assert bisects(light, place)
-    assert bisects(moved, place)
 
 
 def test_rows_are_medians_and_ninetieths_by_band_and_within_35_degrees() -> None:

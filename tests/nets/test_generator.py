@@ -18,7 +18,15 @@ from nets.generator import (
     upsampled_convolution,
     upsampled_convolution_reference,
 )
-from nets.light_head import MIN_LIGHT_Z, LightEncoder, LightHead, light_from_output, light_to_output
+from nets.light_head import (
+    MIN_LIGHT_Z,
+    LightEncoder,
+    LightHead,
+    at_height,
+    light_from_output,
+    light_to_output,
+)
+from nets.render import AUTHORS_CAMERA
 from nets.svbrdf import CHANNELS, MAPS
 from tests.helpers import assert_close, gradcheck, random_light, random_svbrdf, seeded
 
@@ -304,7 +312,25 @@ def test_the_light_encoder_sees_where_things_are_and_no_maps() -> None:
     spot = even.clone()
     spot[..., 20:60, 180:220] = 1.0
     assert not torch.allclose(network.estimate_light(spot), network.estimate_light(spot.flip(-2)), atol=1e-6)
-    assert float(light_from_output(network.estimate_light(even)).position[0, 2]) > MIN_LIGHT_Z
+    heights = light_from_output(network.estimate_light(torch.cat([even, spot]))).position[:, 2]
+    assert_close(heights, torch.full((2,), AUTHORS_CAMERA[2]))  # where the camera is
+
+
+@pytest.mark.parametrize("height", [1.0, 2.4, 7.0])
+def test_a_light_at_another_height_has_its_mirror_image_at_the_same_place(height: float) -> None:
+    camera = torch.tensor(AUTHORS_CAMERA, dtype=torch.float64)
+    light = torch.tensor([[0.6, -0.4, 2.4], [-0.1, 0.3, 1.2]], dtype=torch.float64)
+    moved = at_height(light, torch.full((2,), height, dtype=torch.float64))
+    assert_close(moved[:, 2], torch.full((2,), height, dtype=torch.float64))
+
+    def bisects(position: Tensor, place: Tensor) -> bool:
+        towards = [torch.nn.functional.normalize(point - place, dim=1) for point in (position, camera)]
+        return bool((sum(towards)[:, :2].abs() < 1e-12).all())  # half vector upright
+
+    share = camera[2] / (camera[2] + light[:, 2:])
+    place = torch.cat([light[:, :2] * share, torch.zeros_like(share)], dim=1)
+    assert bisects(light, place)
+    assert bisects(moved, place)
 
 
 @torch.no_grad()
