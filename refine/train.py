@@ -129,7 +129,7 @@ def train(
             training, validation = (
                 batch_source(
                     materials[part],
-                    plan.augmentation,
+                    one.augmentation,
                     one.photography,
                     pairs_of[part],
                     one.pairs,

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from losses.baselines import AutoencoderObjective, RenderingObjective
 from losses.objective import HybridObjective
@@ -35,6 +35,7 @@ class Stage:
         trainer: phases, learning rates, seed.
         pairs: real pairs per shard.
         parts: of the network that are trained, as the generator calls them (`light_head`); none names all.
+        augmentation: how its materials are varied.
         photography: how its photos are taken.
     """
 
@@ -44,6 +45,7 @@ class Stage:
     trainer: TrainerConfig
     pairs: int = 0
     parts: tuple[str, ...] = ()
+    augmentation: Augmentation = field(default_factory=Augmentation)
     photography: FlashPhotography = field(default_factory=FlashPhotography)
 
 
@@ -55,14 +57,12 @@ class TrainingPlan:
         critics: shape of each critic: width, layers, scales.
         stages: in order; each starts from the networks of the last one of its shape before it.
         shares: how often each collection of a pool is drawn; empty draws every material alike.
-        augmentation: how materials are varied.
         precision: `32-true` or `bf16-mixed`.
     """
 
     critics: Mapping[str, int]
     stages: tuple[Stage, ...]
     shares: Mapping[str, float] = field(default_factory=dict)
-    augmentation: Augmentation = field(default_factory=Augmentation)
     precision: str = "32-true"
 
     def as_dict(self, stage: Stage) -> dict[str, Any]:
@@ -74,7 +74,7 @@ class TrainingPlan:
             "pairs": stage.pairs,
             "parts": list(stage.parts),
             "shares": dict(self.shares),
-            "augmentation": asdict(self.augmentation),
+            "augmentation": asdict(stage.augmentation),
             "photography": asdict(stage.photography),
             "precision": self.precision,
         }
@@ -118,8 +118,11 @@ def plan_of(content: Any) -> TrainingPlan:
     common = _mapping(entries.get("trainer", {}), "trainer")
     if not isinstance(entries["stages"], list) or not entries["stages"]:
         raise ValueError("stages must be a list of at least one stage")
-    photography = override(FlashPhotography(), _mapping(entries.get("photography", {}), "photography"))
-    stages = tuple(_stage(stage, common, generator, photography) for stage in entries["stages"])
+    simulation = Simulation(
+        override(Augmentation(), _mapping(entries.get("augmentation", {}), "augmentation")),
+        override(FlashPhotography(), _mapping(entries.get("photography", {}), "photography")),
+    )
+    stages = tuple(_stage(stage, common, generator, simulation) for stage in entries["stages"])
     names = [stage.name for stage in stages]
     if len(set(names)) != len(names):
         raise ValueError(f"stages must have names of their own, got {', '.join(names)}")
@@ -134,7 +137,6 @@ def plan_of(content: Any) -> TrainingPlan:
         critics=critics,
         stages=stages,
         shares={name: float(share) for name, share in shares.items()},
-        augmentation=override(Augmentation(), _mapping(entries.get("augmentation", {}), "augmentation")),
         precision=precision,
     )
 
@@ -142,14 +144,18 @@ def plan_of(content: Any) -> TrainingPlan:
 OPTIONAL = ("generator", "critics", "trainer", "shares", "augmentation", "photography", "precision")
 
 
-STAGE_OPTIONAL = ("network", "trainer", "pairs", "parts", "photography")
+STAGE_OPTIONAL = ("network", "trainer", "pairs", "parts", "augmentation", "photography")
+
+
+class Simulation(NamedTuple):
+    """What a plan says of all stages' materials and photos."""
+
+    augmentation: Augmentation
+    photography: FlashPhotography
 
 
 def _stage(
-    content: Any,
-    common: Mapping[str, Any],
-    generator: NetworkConfig | None,
-    photography: FlashPhotography,
+    content: Any, common: Mapping[str, Any], generator: NetworkConfig | None, simulation: Simulation
 ) -> Stage:
     required, optional = ("name", "objective", "phases"), STAGE_OPTIONAL
     entries = _mapping(content, "a stage", required=required, optional=optional)
@@ -187,8 +193,11 @@ def _stage(
     parts = entries.get("parts", [])
     if not isinstance(parts, list) or not all(isinstance(part, str) for part in parts):
         raise ValueError(f"{where}: parts must be a list of the network's parts, got {parts!r}")
-    own = _mapping(entries.get("photography", {}), f"{where}: photography")
-    return Stage(name, network, objective, trainer, pairs, tuple(parts), override(photography, own))
+    augmentation, photography = (
+        override(common_values, _mapping(entries.get(entry, {}), f"{where}: {entry}"))
+        for entry, common_values in zip(Simulation._fields, simulation, strict=True)
+    )
+    return Stage(name, network, objective, trainer, pairs, tuple(parts), augmentation, photography)
 
 
 def _network(content: Any, where: str) -> NetworkConfig:

@@ -57,6 +57,7 @@ class Augmentation:
         specular: deviation of the logarithm of the factor of F0.
         specular_hue: deviation of the rotation of F0 colours about grey, radians; grey stays grey.
         relief: deviation of the logarithm of the factor of slopes.
+        relief_factor: that factor's median.
         metal: share of materials turned into metal: hardly any diffuse, its pattern as F0, smoother. Few
             textures are of bare metal, and on it relief is all there is to see.
     """
@@ -76,6 +77,7 @@ class Augmentation:
     specular: float = 0.25
     specular_hue: float = 0.1
     relief: float = 0.3
+    relief_factor: float = 1.0
     metal: float = 0.0
 
     @staticmethod
@@ -222,7 +224,7 @@ def jitter(svbrdf: SVBRDF, generator: torch.Generator, settings: Augmentation) -
         settings: the deviations are used.
     """
     draw = torch.randn(svbrdf.batch, 10, generator=generator)
-    relief = torch.exp(draw[:, 0] * settings.relief)[:, None, None, None]
+    relief = settings.relief_factor * torch.exp(draw[:, 0] * settings.relief)[:, None, None, None]
     normal = torch.cat([svbrdf.normal[:, :2] * relief, svbrdf.normal[:, 2:]], dim=1)
 
     gain = torch.exp(draw[:, 1:4] * settings.gain + draw[:, 4:5] * settings.exposure)

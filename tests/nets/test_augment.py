@@ -2,6 +2,7 @@
 
 import math
 import time
+from dataclasses import replace
 
 import pytest
 import torch
@@ -174,6 +175,9 @@ def test_relief_scales_slopes() -> None:
     factor = ratio.flatten(1).median(dim=1).values
     torch.testing.assert_close(ratio, factor[:, None, None, None].expand_as(ratio), rtol=1e-3, atol=1e-3)
     assert float(factor.log().std()) > 0.2
+    steeper = jitter(material, torch.Generator().manual_seed(0), replace(settings, relief_factor=1.6))
+    slopes = [m.normal[:, :2] / m.normal[:, 2:] for m in (steeper, result)]
+    torch.testing.assert_close(slopes[0], 1.6 * slopes[1], rtol=1e-3, atol=1e-4)
 
 
 @pytest.mark.parametrize("smooth", [0.0, 1.0])

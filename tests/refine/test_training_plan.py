@@ -49,16 +49,17 @@ def test_the_paper_s_plan_has_the_paper_s_numbers() -> None:
     assert (syn, hyb) == (PAPER.synthetic, PAPER)
     assert [stage.pairs for stage in plan.stages] == [0, 0, 1]
     assert plan.precision == "32-true"
-    varied = plan.augmentation
+    (varied,) = {stage.augmentation for stage in plan.stages}
     assert (varied.mix_probability, varied.hue, varied.relief, varied.metal) == (0.0, 0.0, 0.0, 0.0)
 
 
 def test_the_narrow_plan_is_of_the_network_that_is_shipped() -> None:
     plan = read_plan(CONFIGS / "narrow.yaml")
-    assert [stage.name for stage in plan.stages] == ["l1", "syn", "light", "hyb", "revise"]
-    first = replace(NARROW_GENERATOR, revision_channels=0)
-    assert [stage.network for stage in plan.stages] == [*[first] * 4, NARROW_GENERATOR]
-    kinds = (L1Objective, SyntheticObjective, LightObjective, HybridObjective, SyntheticObjective)
+    assert [stage.name for stage in plan.stages] == ["l1", "syn", "light", "hyb", "revise", "relief"]
+    first = replace(NARROW_GENERATOR, revision_channels=0, revision_passes=1)
+    once = replace(NARROW_GENERATOR, revision_passes=1)
+    assert [stage.network for stage in plan.stages] == [*[first] * 4, once, NARROW_GENERATOR]
+    kinds = (L1Objective, SyntheticObjective, LightObjective, HybridObjective, *[SyntheticObjective] * 2)
     for stage, kind in zip(plan.stages, kinds, strict=True):
         assert isinstance(stage.objective, kind)
         assert {phase.shards for phase in stage.trainer.phases} == {2}
@@ -66,10 +67,10 @@ def test_the_narrow_plan_is_of_the_network_that_is_shipped() -> None:
     real = {"camera": {"kind": "collocated"}, "rendering": {"perceptual": 1.0}, "perceptual_layers": 3}
     changes = {"synthetic": {"maps": {"adversarial": 0.1}}, "real": real, "real_weight": 1.0}
     assert plan.stages[3].objective == override(NARROW, changes)
-    light, others, revision = ({*stage.parts} for stage in plan.stages[2:])
-    assert (light, revision) == ({"light_head"}, {"revision"})
-    assert not plan.stages[4].objective.judged
-    assert others | light | revision == {name for name, _ in build(NARROW_GENERATOR).named_children()}
+    light, others, revision, both = ({*stage.parts} for stage in plan.stages[2:])
+    assert (light, revision, both) == ({"light_head"}, {"revision"}, others | revision)
+    assert not any(stage.objective.judged for stage in plan.stages[4:])
+    assert both | light == {name for name, _ in build(NARROW_GENERATOR).named_children()}
     assert plan.precision == "bf16-mixed"
 
 
@@ -81,7 +82,7 @@ def test_the_plan_of_the_baselines_is_of_the_networks_that_are_shipped() -> None
     assert [stage.objective for stage in plan.stages] == [replace(DES18, map_weight=0.1), DES19, GAO19]
     narrow = read_plan(CONFIGS / "narrow.yaml")
     assert plan.shares == narrow.shares
-    assert plan.augmentation == narrow.augmentation
+    assert {stage.augmentation for stage in plan.stages} == {narrow.stages[0].augmentation}
     assert {stage.photography for stage in plan.stages} == {narrow.stages[0].photography}
 
 
@@ -106,7 +107,7 @@ def test_a_stage_overrides_what_is_common() -> None:
             "generator": {"width": 2, "levels": 4},
             "trainer": {"learning_rate": 1, "ema_decay": 0.5},
             "shares": {"procedural": 2},
-            "augmentation": {"scale": [0.5, 1]},
+            "augmentation": {"scale": [0.5, 1], "relief": 0.2},
             "photography": {"falloff_share": 0.5, "lights": {"max_angle": 10}},
             "stages": [
                 {
@@ -114,6 +115,7 @@ def test_a_stage_overrides_what_is_common() -> None:
                     "objective": {"kind": "l1", "map_weight": 3},
                     "phases": [{"iterations": 1, "crop": 16, "batch": 1, "shards": 2}],
                     "trainer": {"learning_rate": 0.5},
+                    "augmentation": {"relief": 0.6},
                     "photography": {"lights": {"max_angle": 20}},
                 },
                 {
@@ -130,7 +132,9 @@ def test_a_stage_overrides_what_is_common() -> None:
     assert (stage.trainer.learning_rate, stage.trainer.ema_decay) == (0.5, 0.5)
     assert stage.trainer.phases == (Phase(1, 16, 1, 2),)
     assert plan.shares == {"procedural": 2.0}
-    assert plan.augmentation.scale == (0.5, 1.0)
+    varied = [(one.augmentation.scale, one.augmentation.relief) for one in (stage, plain)]
+    assert varied == [((0.5, 1.0), 0.6), ((0.5, 1.0), 0.2)]
+    assert plan.as_dict(stage)["augmentation"]["relief"] == 0.6
     taken = [(one.photography.falloff_share, one.photography.lights.max_angle) for one in (stage, plain)]
     assert taken == [(0.5, 20.0), (0.5, 10.0)]
     assert plan.as_dict(stage)["photography"]["lights"]["max_angle"] == 20.0
@@ -184,6 +188,7 @@ MISTAKES: list[tuple[str, Any, str]] = [
     ("augmentation/soup", 1, "Augmentation has no 'soup'"),
     ("augmentation/scale", 0.5, "Augmentation.scale must be of type tuple, got 0.5"),
     ("photography/lights/soup", 1, "LightDistribution has no 'soup'"),
+    ("stages/0/augmentation", {"soup": 1}, "Augmentation has no 'soup'"),
     ("stages/0/photography", {"soup": 1}, "FlashPhotography has no 'soup'"),
     ("precision", 16, "precision must be one of 32-true, bf16-mixed, got 16"),
     ("stages/0/name", ABSENT, "a stage lacks name"),
