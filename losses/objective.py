@@ -27,7 +27,7 @@ from losses.score import Perceptual, Score, TermWeights, exposure_gain, random_w
 from nets.color import gamma_encode
 from nets.generator import Generator, maps_to_svbrdf
 from nets.light_head import light_from_output, light_to_output
-from nets.render import Camera, render
+from nets.render import Camera, PointLight, render
 from nets.sampling import LightDistribution
 from nets.svbrdf import CHANNELS, MAPS, SVBRDF
 from nets.training import Losses, TrainingBatch
@@ -111,6 +111,7 @@ class SyntheticObjective:
         log_offset: compare logarithms of `radiance + offset` in the L1 of renderings; 0 compares encoded
             images, in [0, 1].
         lights: where the random lights come from.
+        told_share: of photos whose true lights are told to the network's revision; 0 in the paper.
         window: critics and VGG see a random square of this side; 0 shows them everything.
         perceptual_samples: so many of a batch go through VGG; 0 shows it all.
         perceptual_layers: so many of its layers are compared, the shallowest; 0 compares all.
@@ -125,6 +126,7 @@ class SyntheticObjective:
     more_lights: int = 0
     log_offset: float = 0.0
     lights: LightDistribution = TRAINING_LIGHTS
+    told_share: float = 0.0
     window: int = 0
     perceptual_samples: int = 0
     perceptual_layers: int = 0
@@ -145,7 +147,10 @@ class SyntheticObjective:
     ) -> Losses:
         """Return both players' losses and their parts on one batch."""
         condition = batch.network_input
-        maps, light = network(condition)
+        if self.told_share:
+            maps, light = network(condition, self._told(network, condition, batch.light, generator))
+        else:
+            maps, light = network(condition)
         estimate = maps_to_svbrdf(maps.float())
         parts, truths = network_maps(estimate), network_maps(batch.truth)
         seen = random_window(self.window, condition, generator)
@@ -158,6 +163,17 @@ class SyntheticObjective:
         if self.rendering_weight:
             self._add_renderings(score, critics, estimate, batch, condition, seen, generator)
         return score.losses()
+
+    @torch.no_grad()
+    def _told(
+        self, network: Generator, condition: Tensor, light: PointLight, generator: torch.Generator
+    ) -> PointLight:
+        """Return the true lights of some photos and the network's guesses of the others."""
+        guess = light_from_output(network.estimate_light(condition).float())
+        told = torch.rand(len(condition), 1, generator=generator) < self.told_share
+        return PointLight(
+            torch.where(told.to(condition.device), light.position, guess.position), guess.intensity
+        )
 
     def _add_renderings(
         self,

@@ -38,9 +38,12 @@ def find_config(kind: str) -> type[NetworkConfig]:
 
 
 def continues(config: NetworkConfig, earlier: NetworkConfig) -> bool:
-    """Return whether a network can start from another: its like, or one that has no revision yet."""
+    """Return whether a network can start from another: its like, or one that revises less often or never."""
     if isinstance(config, GeneratorConfig) and isinstance(earlier, GeneratorConfig):
-        return earlier in (config, replace(config, revision_channels=0))
+        if earlier.revision_passes > config.revision_passes:
+            return False
+        like = replace(earlier, revision_passes=config.revision_passes)
+        return like in (config, replace(config, revision_channels=0))
     return config == earlier
 
 

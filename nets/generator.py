@@ -15,7 +15,7 @@ from torch.nn import functional
 
 from nets.color import to_network_input
 from nets.light_head import LEAKY_SLOPE, LightEncoder, LightHead, light_from_output
-from nets.render import PointLight
+from nets.render import Camera, PointLight
 from nets.revision import REVISION_WIDTHS, Revision, feedback
 from nets.shading_cues import CUES, shading_cues
 from nets.svbrdf import CHANNELS, MAPS, SVBRDF
@@ -49,6 +49,7 @@ class GeneratorConfig:
             the bottleneck.
         revision_channels: at full resolution, of the second look that sees the maps' own re-rendering, see
             `Revision`; 0 leaves it out, as the paper does.
+        revision_passes: how often it looks, with the same weights, each time at what it made of the maps.
     """
 
     width: int = 64
@@ -58,6 +59,7 @@ class GeneratorConfig:
     detail_channels: int = 0
     light_channels: int = 0
     revision_channels: int = 0
+    revision_passes: int = 1
 
     def __post_init__(self) -> None:
         """Refuse shapes that cannot be built."""
@@ -67,6 +69,7 @@ class GeneratorConfig:
             or self.detail_channels < 0
             or self.light_channels < 0
             or self.revision_channels < 0
+            or self.revision_passes < 1
             or (self.revision_channels and self.levels < len(REVISION_WIDTHS))
             or not 2 <= self.levels <= 10
         ):
@@ -101,6 +104,7 @@ NARROW_GENERATOR = GeneratorConfig(
     detail_channels=16,
     light_channels=24,
     revision_channels=16,
+    revision_passes=2,
 )
 """What is trained on two CPU cores and shipped: see docs/architecture.md for what differs and why."""
 
@@ -207,7 +211,7 @@ class Generator(nn.Module):
     """Photo to maps and light.
 
     `forward` speaks the network's own range; `predict` takes a linear photo and returns a legal
-    `SVBRDF` and a `PointLight`.
+    `SVBRDF` and a `PointLight`, and so does `predict_under`, which is told the light.
     """
 
     def __init__(self, config: GeneratorConfig = PAPER_GENERATOR) -> None:
@@ -242,9 +246,17 @@ class Generator(nn.Module):
         return features
 
     def forward(
-        self, photo: Float[Tensor, "b 3 h w"]
+        self,
+        photo: Float[Tensor, "b 3 h w"],
+        known: PointLight | None = None,
+        camera: Camera | None = None,
     ) -> tuple[Float[Tensor, "b 10 h w"], Float[Tensor, "b 3"]]:
         """Map an encoded photo in [-1, 1] to maps in [-1, 1] (order of `MAPS`) and a standardised light.
+
+        Args:
+            photo: encoded; see also `nets.color.to_network_input`.
+            known: the photos' lights, under which the revision renders; by default what is estimated.
+            camera: of the photos, likewise; the authors' by default.
 
         Raises:
             ValueError: if a side is not a multiple of `config.multiple`, naming the shape.
@@ -263,10 +275,11 @@ class Generator(nn.Module):
             maps = maps + self.detail(maps, more, seen)
         light = self.light_head(photo if self.config.light_channels else features[-1])
         if self.revision is not None:
-            estimate = torch.tanh(maps.float())
-            lit = light_from_output(light.detach().float())
-            found = feedback(maps_to_svbrdf(estimate.detach()), lit, photo)
-            maps = maps + self.revision(seen, estimate, found)
+            lit = known or light_from_output(light.detach().float())
+            for _ in range(self.config.revision_passes):
+                estimate = torch.tanh(maps.float())
+                found = feedback(maps_to_svbrdf(estimate.detach()), lit, photo, camera)
+                maps = maps + self.revision(seen, estimate, found)
         return torch.tanh(maps), light
 
     def estimate_light(self, photo: Float[Tensor, "b 3 h w"]) -> Float[Tensor, "b 3"]:
@@ -275,13 +288,28 @@ class Generator(nn.Module):
         light: Tensor = self.light_head(photo if alone else self.encode(self.see(photo))[-1])
         return light
 
-    @torch.no_grad()
     def predict(self, photo: Float[Tensor, "b 3 h w"]) -> tuple[SVBRDF, PointLight]:
         """Estimate material and light of linear photos (clamped to 1 here), sides as in `forward`."""
+        return self.predict_under(photo)
+
+    @torch.no_grad()
+    def predict_under(
+        self,
+        photo: Float[Tensor, "b 3 h w"],
+        known: PointLight | None = None,
+        camera: Camera | None = None,
+    ) -> tuple[SVBRDF, PointLight]:
+        """Estimate the material of linear photos whose lights may be known; the light returned is a guess.
+
+        Args:
+            photo: as `predict` takes it.
+            known: one light per photo; only a network with a revision makes use of it.
+            camera: of the photos, likewise.
+        """
         training = self.training
         self.eval()
         try:
-            maps, light = self(to_network_input(photo))
+            maps, light = self(to_network_input(photo), known, camera)
         finally:
             self.train(training)
         return maps_to_svbrdf(maps), light_from_output(light)

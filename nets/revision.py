@@ -40,7 +40,10 @@ REVISION_WIDTHS = (1.5, 3.0, 4.0)
 
 
 def feedback(
-    estimate: SVBRDF, light: PointLight, photo: Float[Tensor, "b 3 h w"]
+    estimate: SVBRDF,
+    light: PointLight,
+    photo: Float[Tensor, "b 3 h w"],
+    camera: Camera | None = None,
 ) -> Float[Tensor, "b 20 h w"]:
     """Return what a photo says of an estimate of it: features, through which no gradient flows.
 
@@ -48,6 +51,7 @@ def feedback(
         estimate: the material.
         light: where its flash is taken to be, one per material.
         photo: encoded to [-1, 1], as the network sees it.
+        camera: of the photo; the authors' by default.
 
     Returns:
         The rendering, encoded to [-1, 1]; how much brighter the photo is, times `RESIDUAL_SCALE`; how far
@@ -56,7 +60,7 @@ def feedback(
     """
     with torch.no_grad(), torch.autocast(photo.device.type, enabled=False):
         points = surface_points(*estimate.size, device=photo.device)
-        geometry = shading_geometry(points, light, Camera())
+        geometry = shading_geometry(points, light, camera or Camera())
         target = (photo.float() + 1.0) / 2.0
         rendering, residual, step = explaining_step(estimate, geometry, target)
         half_vector, normal = geometry.half_vector, estimate.normal

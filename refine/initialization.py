@@ -12,7 +12,7 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn import functional
 
-from nets.ensemble import Predictor
+from nets.ensemble import Predictor, PredictorUnderLight
 from nets.render import Camera, PointLight
 from nets.svbrdf import SVBRDF
 from refine.upsampling import Box, legal, upsample
@@ -38,7 +38,8 @@ def initialize(
     Args:
         model: `predict`, or an object that has it.
         photo: linear radiance of any size.
-        light: of the photo, if known; only large photos need it, to tell slopes from paint.
+        light: of the photo, if known; a network with a revision makes use of it, and large photos need it,
+            to tell slopes from paint.
         camera: of the photo, likewise; as in `nets.render.render`.
 
     Returns:
@@ -47,13 +48,12 @@ def initialize(
     Raises:
         ValueError: if the model returns anything but a legal `SVBRDF` of the square's size and a light.
     """
-    predict = model.predict if isinstance(model, Predictor) else model
     height, width = photo.shape[-2:]
     longer = max(height, width)
     top, left = (longer - height) // 2, (longer - width) // 2
     with torch.no_grad():
         seen = _square(photo, top, left)
-        svbrdf, guess = _checked(predict(seen))
+        svbrdf, guess = _checked(_ask(model, seen, light, camera))
         svbrdf = svbrdf.detach()
         if longer > NETWORK_SIZE:
             place = Box(top / longer, left / longer, height / longer, width / longer)
@@ -62,6 +62,12 @@ def initialize(
             window = (..., slice(top, top + height), slice(left, left + width))
             whole = legal(svbrdf.map(lambda tensor: _resize(tensor, (longer, longer))[window].contiguous()))
     return whole.validate(), guess
+
+
+def _ask(model: Predict | Predictor, seen: Tensor, light: PointLight | None, camera: Camera | None) -> object:
+    if isinstance(model, PredictorUnderLight):
+        return model.predict_under(seen, light, camera)
+    return model.predict(seen) if isinstance(model, Predictor) else model(seen)
 
 
 def _checked(answer: object) -> tuple[SVBRDF, PointLight]:

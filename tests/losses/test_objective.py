@@ -399,6 +399,32 @@ def test_more_lights_are_weighed_like_the_first(batch: TrainingBatch) -> None:
     assert_close(found, (one + 2 * others) / 3)
 
 
+@pytest.mark.parametrize("share", [0.0, 0.5, 1.0])
+def test_the_revision_is_told_so_many_of_the_true_lights(batch: TrainingBatch, share: float) -> None:
+    network = Generator(replace(TINY, revision_channels=4)).eval()
+    asked: list[PointLight | None] = []
+
+    def listening(photo: Tensor, known: PointLight | None = None) -> tuple[Tensor, Tensor]:
+        asked.append(known)
+        return Generator.forward(network, photo, known)
+
+    network.forward = listening  # type: ignore[method-assign]
+    no_critic = TermWeights(adversarial=0.0, feature=0.0, perceptual=0.0)
+    objective = SyntheticObjective(maps=no_critic, rendering=no_critic, told_share=share)
+    guess = light_from_output(network.estimate_light(batch.network_input)).position
+    counts = {"told": 0, "guessed": 0}
+    for seed in range(20):
+        objective(network, nn.ModuleDict(), batch, seeded(seed))
+        known = asked[-1]
+        if known is None:
+            continue
+        for position, true, guessed in zip(known.position, batch.light.position, guess, strict=True):
+            counts["told"] += torch.equal(position, true)
+            counts["guessed"] += torch.equal(position, guessed)
+    assert sum(counts.values()) == (20 * len(guess) if share else 0)
+    assert counts["told"] == pytest.approx(share * 20 * len(guess), abs=12 * (share == 0.5))
+
+
 def test_vgg_sees_as_many_as_it_is_shown(batch: TrainingBatch) -> None:
     seen = []
 

@@ -50,3 +50,36 @@ def test_the_average_is_symmetric_and_legal() -> None:
     assert torch.allclose(turned_light.position[:, 0], -light.position[:, 0], atol=1e-5)
     alone = network.network.predict(photo)[0]
     assert not torch.allclose(alone.channels(), svbrdf.channels(), atol=1e-3)
+
+
+def test_a_known_light_is_mirrored_with_the_photo() -> None:
+    asked: list[tuple[torch.Tensor, PointLight | None, Camera | None]] = []
+
+    class Listens:
+        def predict(self, photo: torch.Tensor) -> tuple[SVBRDF, PointLight]:
+            raise AssertionError("what is known is to be told")
+
+        def predict_under(
+            self, photo: torch.Tensor, known: PointLight | None = None, camera: Camera | None = None
+        ) -> tuple[SVBRDF, PointLight]:
+            asked.append((photo, known, camera))
+            return SVBRDF.constant(8, 8), PointLight.at((0.0, 0.0, 2.0))
+
+    truth, known = random_svbrdf(1, 8, 8), PointLight.at((0.4, -0.3, 1.7), 0.9, falloff="inverse_square")
+    camera = Camera(position=(0.2, 0.1, 2.5))
+    photo = render(truth, known, camera)
+    FlipAverage(Listens()).predict_under(photo, known, camera)
+    assert len(asked) == len(FLIPS)
+    for axes, (seen, light, eye) in zip(FLIPS, asked, strict=True):
+        assert light is not None
+        assert torch.allclose(render(mirror(truth, axes), light, eye), seen, atol=1e-5)
+
+
+def test_who_makes_no_use_of_lights_is_not_told() -> None:
+    class Deaf:
+        def predict(self, photo: torch.Tensor) -> tuple[SVBRDF, PointLight]:
+            return SVBRDF.constant(8, 8), PointLight.at((0.0, 0.0, 2.0))
+
+    known = PointLight.at((0.4, -0.3, 1.7))
+    _, light = FlipAverage(Deaf()).predict_under(torch.rand(1, 3, 8, 8), known)
+    assert light.position.tolist() == [[0.0, 0.0, 2.0]]

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 import torch
 
 from nets.color import ENCODING_FLOOR, to_network_input
-from nets.generator import Generator, GeneratorConfig
+from nets.generator import Generator, GeneratorConfig, maps_to_svbrdf
+from nets.light_head import light_from_output
 from nets.render import Camera, PointLight, render, shade, shading_geometry, surface_points
 from nets.revision import (
     FEEDBACK,
@@ -164,6 +167,44 @@ def test_it_begins_as_no_correction() -> None:
         assert_close(ours, theirs)
 
 
+def stirred() -> Generator:
+    """A network whose revision does something."""
+    network = revised().eval()
+    assert network.revision is not None
+    torch.nn.init.normal_(network.revision.last.weight, std=0.05, generator=seeded(8))
+    return network
+
+
+@torch.no_grad()
+def test_it_looks_as_often_as_it_is_told_to() -> None:
+    once = stirred()
+    twice = Generator(replace(once.config, revision_passes=2)).eval()
+    twice.load_state_dict(once.state_dict())
+    assert once.revision is not None
+    photo = torch.rand(1, 3, 32, 16, generator=seeded(2)) * 2 - 1
+    maps, light = once(photo)
+    assert torch.equal(twice(photo)[1], light)
+    found = feedback(maps_to_svbrdf(maps), light_from_output(light), photo)
+    expected = torch.tanh(torch.atanh(maps) + once.revision(once.see(photo), maps, found))
+    assert_close(twice(photo)[0], expected, rtol=1e-4, atol=1e-5)
+    assert not torch.allclose(expected, maps, atol=1e-3)
+
+
+@torch.no_grad()
+def test_a_light_that_is_known_is_looked_under_and_not_repeated() -> None:
+    network = stirred()
+    photo = torch.rand(2, 3, 32, 16, generator=seeded(2))
+    maps, guess = network.predict(photo)
+    under_guess, _ = network.predict_under(photo, guess)
+    assert_close(under_guess.channels(), maps.channels(), rtol=1e-4, atol=1e-5)
+    known = PointLight.at((0.5, -0.4, 1.4)).expand(2)
+    under_known, still = network.predict_under(photo, known)
+    assert not torch.allclose(under_known.channels(), maps.channels(), atol=1e-3)
+    assert torch.equal(still.position, guess.position)
+    elsewhere, _ = network.predict_under(photo, known, Camera("collocated"))
+    assert not torch.allclose(elsewhere.channels(), under_known.channels(), atol=1e-3)
+
+
 def test_every_weight_is_trained_once_the_last_is_not_zero() -> None:
     network = revised()
     assert network.revision is not None
@@ -206,7 +247,9 @@ def test_it_learns_to_take_from_the_residual_what_the_maps_lack() -> None:
     assert float(after.detach()) < 0.2 * float(before)
 
 
-@pytest.mark.parametrize("wrong", [{"revision_channels": -1}, {"levels": 2, "revision_channels": 4}])
+@pytest.mark.parametrize(
+    "wrong", [{"revision_channels": -1}, {"levels": 2, "revision_channels": 4}, {"revision_passes": 0}]
+)
 def test_impossible_shapes_are_refused(wrong: dict[str, int]) -> None:
     with pytest.raises(ValueError, match="not a generator"):
         GeneratorConfig(**{"width": 2, "levels": 4, **wrong})

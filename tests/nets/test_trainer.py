@@ -14,6 +14,7 @@ import pytest
 import torch
 from torch import Tensor, nn
 
+from nets.architectures import continues
 from nets.generator import Generator, GeneratorConfig, svbrdf_to_maps
 from nets.light_head import light_to_output
 from nets.render import render
@@ -344,6 +345,18 @@ def test_parts_that_a_network_lacks_as_a_whole_begin_anew() -> None:
     del weights["encoder.0.weight"]
     with pytest.raises(RuntimeError, match=r"encoder\.0\.weight"):
         trainer().take_weights(weights, weights)
+
+
+def test_a_network_may_start_from_one_that_revises_less() -> None:
+    never, once, twice = (
+        replace(TINY, revision_channels=channels, revision_passes=passes)
+        for channels, passes in ((0, 1), (2, 1), (2, 2))
+    )
+    for later, earlier in ((once, never), (twice, never), (twice, once), (twice, twice)):
+        assert continues(later, earlier)
+    wider = replace(twice, width=twice.width + 1)
+    for later, earlier in ((never, once), (once, twice), (wider, once)):
+        assert not continues(later, earlier)
 
 
 def test_only_the_named_parts_are_trained_and_only_they_drop_out() -> None:

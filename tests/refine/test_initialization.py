@@ -11,7 +11,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from nets.render import PointLight, surface_points
+from nets.render import Camera, PointLight, surface_points
 from nets.svbrdf import SVBRDF
 from refine.initialization import NETWORK_SIZE, initialize
 from refine.upsampling import legal
@@ -109,6 +109,24 @@ def test_a_model_may_be_an_object_with_predict() -> None:
 
     photo = torch.rand(1, 3, 40, 64)
     assert torch.equal(initialize(Network(), photo)[0].diffuse, initialize(echo, photo)[0].diffuse)
+
+
+def test_a_model_that_makes_use_of_a_known_light_is_told() -> None:
+    told: list[object] = []
+
+    class Network:
+        def predict(self, photo: Tensor) -> tuple[SVBRDF, PointLight]:
+            raise AssertionError("what is known is to be told")
+
+        def predict_under(
+            self, photo: Tensor, known: PointLight | None = None, camera: Camera | None = None
+        ) -> tuple[SVBRDF, PointLight]:
+            told.extend([known, camera])
+            return echo(photo)
+
+    light, camera = PointLight.at((0.3, 0.1, 2.0)), Camera("collocated")
+    initialize(Network(), torch.rand(1, 3, 40, 64), light, camera)
+    assert told == [light, camera]
 
 
 def test_no_gradients_are_kept() -> None:
