@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import time
 from pathlib import Path
 from typing import Any
@@ -20,7 +21,10 @@ from nets.trainer import Trainer, stream_seed
 from nets.training import BatchSource, TrainingBatch
 
 VALIDATION_SHARDS = 4
-"""Batches of held-out data that figures are averaged over."""
+"""At least so many batches of held-out data are what figures are averaged over."""
+
+VALIDATION_PHOTOS = 32
+"""And so many photos: the accuracies of critics on fewer say little."""
 
 SHEET_MATERIALS = 3
 """Held-out materials on a sample sheet, two rows each: truth, then estimate."""
@@ -64,13 +68,14 @@ class Watch:
         phase = trainer.config.phase_at(trainer.iteration)
         trainer.network.eval()
         sums: dict[str, float] = {}
-        for shard in range(VALIDATION_SHARDS):
+        shards = max(VALIDATION_SHARDS, math.ceil(VALIDATION_PHOTOS / phase.batch))
+        for shard in range(shards):
             generator = torch.Generator().manual_seed(stream_seed(0, 0, shard))
             batch = self.validation(phase.batch, phase.crop, generator)
             with trainer.team.autocast():
                 losses = trainer.objective(trainer.network, trainer.critics, batch, generator)
             for name, term in {"loss": losses.generator, **losses.terms}.items():
-                sums[name] = sums.get(name, 0.0) + float(term) / VALIDATION_SHARDS
+                sums[name] = sums.get(name, 0.0) + float(term) / shards
         self._write({"iteration": trainer.iteration, "validation": _rounded(sums)})
         for name, value in sums.items():
             self.board.add_scalar(f"validation/{name}", value, trainer.iteration)
@@ -78,7 +83,7 @@ class Watch:
         return sums
 
     def _sheet(self, trainer: Trainer, crop: int) -> None:
-        generator = torch.Generator().manual_seed(stream_seed(0, 0, VALIDATION_SHARDS))
+        generator = torch.Generator().manual_seed(stream_seed(0, 0, VALIDATION_PHOTOS))
         batch = self.validation(SHEET_MATERIALS, crop, generator)
         estimate = _estimate(trainer.average, batch)
         rows = []
