@@ -69,11 +69,9 @@ class FlipAverage:
         maps: list[Tensor] = []
         positions: list[Tensor] = []
         for axes in FLIPS:
-            svbrdf, light = self._predict(
-                photo.flip(axes),
-                known and _mirror_light(known, axes),
-                camera and _mirror_camera(camera, axes),
-            )
+            told = known and _mirror_light(known, axes)
+            eye = camera and _mirror_camera(camera, axes)
+            svbrdf, light = predict_under(self.network, photo.flip(axes), told, eye)
             maps.append(mirror(svbrdf, axes).channels())
             positions.append(_mirror_light(light, axes).position)
         mean = SVBRDF.from_channels(torch.stack(maps).mean(dim=0))
@@ -84,12 +82,14 @@ class FlipAverage:
             PointLight(position, light.intensity, light.falloff),
         )
 
-    def _predict(
-        self, photo: Tensor, known: PointLight | None, camera: Camera | None
-    ) -> tuple[SVBRDF, PointLight]:
-        if isinstance(self.network, PredictorUnderLight):
-            return self.network.predict_under(photo, known, camera)
-        return self.network.predict(photo)
+
+def predict_under(
+    model: Predictor, photo: Float[Tensor, "b 3 h w"], known: PointLight | None, camera: Camera | None
+) -> tuple[SVBRDF, PointLight]:
+    """Ask a model, telling it the light and the camera if it makes use of them."""
+    if isinstance(model, PredictorUnderLight):
+        return model.predict_under(photo, known, camera)
+    return model.predict(photo)
 
 
 def mirror(svbrdf: SVBRDF, axes: tuple[int, ...]) -> SVBRDF:

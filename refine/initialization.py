@@ -12,7 +12,7 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn import functional
 
-from nets.ensemble import Predictor, PredictorUnderLight
+from nets.ensemble import Predictor, predict_under
 from nets.render import Camera, PointLight
 from nets.svbrdf import SVBRDF
 from refine.upsampling import Box, legal, upsample
@@ -65,9 +65,7 @@ def initialize(
 
 
 def _ask(model: Predict | Predictor, seen: Tensor, light: PointLight | None, camera: Camera | None) -> object:
-    if isinstance(model, PredictorUnderLight):
-        return model.predict_under(seen, light, camera)
-    return model.predict(seen) if isinstance(model, Predictor) else model(seen)
+    return predict_under(model, seen, light, camera) if isinstance(model, Predictor) else model(seen)
 
 
 def _checked(answer: object) -> tuple[SVBRDF, PointLight]:

@@ -193,10 +193,11 @@ def _stage(
     parts = entries.get("parts", [])
     if not isinstance(parts, list) or not all(isinstance(part, str) for part in parts):
         raise ValueError(f"{where}: parts must be a list of the network's parts, got {parts!r}")
-    augmentation, photography = (
-        override(common_values, _mapping(entries.get(entry, {}), f"{where}: {entry}"))
-        for entry, common_values in zip(Simulation._fields, simulation, strict=True)
+    varied, taken = (
+        _mapping(entries.get(entry, {}), f"{where}: {entry}") for entry in ("augmentation", "photography")
     )
+    augmentation = override(simulation.augmentation, varied)
+    photography = override(simulation.photography, taken)
     return Stage(name, network, objective, trainer, pairs, tuple(parts), augmentation, photography)
 
 

@@ -49,7 +49,11 @@ def inputs(tmp_path_factory: pytest.TempPathFactory) -> Path:
     write_pairs(folder / "pairs")
     once = [{"iterations": 1, "crop": 16, "batch": 2}]
     write_plan(
-        folder / "tiny.yaml", *({**STAGES[name], "phases": once} for name in ("l1", "syn", "light", "hyb"))
+        folder / "tiny.yaml",
+        *({**STAGES[name], "phases": once} for name in ("l1", "syn", "light")),
+        {**STAGES["hyb"], "name": "hyb0", "phases": once},
+        *({**STAGES["syn"], "name": name, "phases": once} for name in ("revise", "relief")),
+        {**STAGES["hyb"], "phases": once},
     )
     return folder
 
